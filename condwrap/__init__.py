@@ -1,0 +1,17 @@
+"""Measure and regularize the conditioning of reinforcement-learning policies."""
+
+from condwrap.functional import clamping_penalty, conditioning_quotient
+from condwrap.perturbation import gaussian, sphere, uniform
+from condwrap.regularizer import Conditioning, ConditioningRegularizer
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Conditioning",
+    "ConditioningRegularizer",
+    "clamping_penalty",
+    "conditioning_quotient",
+    "gaussian",
+    "sphere",
+    "uniform",
+]
