@@ -1,0 +1,1 @@
+"""Runs the paper's experiments and reports them beside its tables: `python -m harness --help`."""

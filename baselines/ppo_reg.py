@@ -1,0 +1,583 @@
+"""PPO with the conditioning penalty of Asadulaev et al. (arXiv 1906.05437), for continuous actions.
+
+    pip install "condwrap[baselines,bullet]"
+    python ppo_reg.py --env-id HopperBulletEnv-v0 --seed 1         # PPO reg, the paper's settings
+    python ppo_reg.py --env-id HopperBulletEnv-v0 --coefficient 0  # PPO
+
+This file needs nothing but an installed condwrap: copy it and change it. The lines that say
+`# condwrap` are all that the regularizer adds. Without them the file is PPO (Schulman et al., 2017,
+arXiv 1707.06347), and computes bit for bit what `--coefficient 0` does. A run's directory holds
+metrics.csv (a row for each update), TensorBoard events and checkpoint.pt; `--resume` continues a
+run as if it had never stopped.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import functools
+import itertools
+import math
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import torch
+import tyro
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
+from gymnasium.wrappers.utils import RunningMeanStd
+from gymnasium.wrappers.vector import NormalizeReward, RecordEpisodeStatistics
+from torch import Tensor, nn
+from torch.distributions import Independent, Normal
+from torch.utils.tensorboard import SummaryWriter
+
+from condwrap import ConditioningRegularizer  # condwrap
+from condwrap.wrappers import VectorPerturbObservation  # condwrap
+
+
+@dataclasses.dataclass(frozen=True)
+class Args:
+    env_id: str = "HopperBulletEnv-v0"
+    """any Gymnasium task with a Box of actions; "module:id" imports the module first"""
+    seed: int = 1
+    """seed of the run"""
+    agent: int = 0
+    """number of the agent: the paper trains 10 for each seed"""
+    total_timesteps: int = 5_000_000
+    """environment steps to train for, rounded down to whole updates"""
+    num_envs: int = 1
+    """environments, stepped in turn"""
+    num_steps: int = 2000
+    """steps of each environment between two updates"""
+    num_minibatches: int = 40
+    """minibatches in an epoch: 40 of 2000 steps hold 50 each"""
+    update_epochs: int = 10
+    """passes over the rollout by the policy"""
+    learning_rate: float = 3e-4
+    """Adam's step size for the policy"""
+    vf_epochs: int = 10
+    """passes over the rollout by the critic"""
+    vf_learning_rate: float = 3e-4
+    """Adam's step size for the critic, which has an optimizer of its own"""
+    vf_coef: float = 0.5
+    """c2: factor of the critic's squared error"""
+    anneal_lr: bool = False
+    """let both step sizes fall linearly to 0"""
+    gamma: float = 0.99
+    """discount"""
+    gae_lambda: float = 0.95
+    """lambda of generalized advantage estimation"""
+    clip_coef: float = 0.2
+    """PPO's epsilon: how far the probability ratio may move from 1"""
+    ent_coef: float = 0.0
+    """c3: factor of the entropy bonus"""
+    max_grad_norm: float = 0.5
+    """length that the gradients of the policy and of the critic are clipped to"""
+    target_kl: float | None = None
+    """end the policy's epochs once an epoch's mean KL divergence exceeds this"""
+    hidden_sizes: tuple[int, ...] = (64, 64)
+    """widths of the tanh layers, of the policy and of the critic"""
+    norm_obs: bool = True
+    """normalize observations by their running mean and variance, clipped to [-10, 10]"""
+    norm_reward: bool = True
+    """divide rewards, for learning only, by the running deviation of the discounted return"""
+    coefficient: float = 1e-3  # condwrap
+    """c1: factor of the conditioning penalty; 0 is plain PPO, psi still measured"""  # condwrap
+    lambda_min: float = 1.0  # condwrap
+    """lower end of the range that J is kept in"""  # condwrap
+    lambda_max: float = 20.0  # condwrap
+    """upper end of the range that J is kept in"""  # condwrap
+    perturbation: str = "sphere"  # condwrap
+    """kind of delta: sphere, gaussian or uniform"""  # condwrap
+    radius: float = 1.0  # condwrap
+    """size of delta, in the normalized observations' units"""  # condwrap
+    perturb_obs: bool = False  # condwrap
+    """train on perturbed observations: noise augmentation, the penalty's rival"""  # condwrap
+    run_dir: Path | None = None
+    """where the run's files go; by default runs/<environment>__ppo_reg__s<seed>__a<agent>"""
+    resume: bool = False
+    """continue from the run directory's checkpoint, if it has one"""
+    checkpoint_interval: int = 50
+    """updates between two checkpoints; the environments are rebuilt at each"""
+    capture_video: bool = False
+    """record episodes of the first environment (needs moviepy)"""
+    track: bool = False
+    """log to Weights & Biases too (needs wandb; WANDB_PROJECT names the project)"""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if name in POSITIVE and not value > 0:
+                raise ValueError(f"{name} must be above 0, got {value}")
+            if name in ("gamma", "gae_lambda") and not 0 <= value <= 1:
+                raise ValueError(f"{name} must be in [0, 1], got {value}")
+        if self.batch_size % self.num_minibatches or self.batch_size == self.num_minibatches:
+            raise ValueError(
+                f"num_minibatches must divide num_envs * num_steps = {self.batch_size} into parts "
+                f"of 2 or more, got {self.num_minibatches}"
+            )
+        if self.total_timesteps < self.batch_size:
+            raise ValueError(
+                f"total_timesteps must be at least num_envs * num_steps = {self.batch_size}, "
+                f"got {self.total_timesteps}"
+            )
+        ConditioningRegularizer(**self.conditioning)  # condwrap: its own checks
+
+    @property
+    def batch_size(self) -> int:
+        return self.num_envs * self.num_steps
+
+    @property
+    def num_updates(self) -> int:
+        return self.total_timesteps // self.batch_size
+
+    @property  # condwrap
+    def conditioning(self) -> dict[str, Any]:  # condwrap
+        names = ("coefficient", "lambda_min", "lambda_max", "perturbation", "radius")  # condwrap
+        return {name: getattr(self, name) for name in names}  # condwrap
+
+    @property
+    def path(self) -> Path:
+        name = f"{self.env_id.split(':')[-1]}__ppo_reg__s{self.seed}__a{self.agent}"
+        return self.run_dir or Path("runs", name)
+
+
+POSITIVE = {"num_envs", "num_steps", "num_minibatches", "update_epochs", "learning_rate"}
+POSITIVE |= {"vf_epochs", "vf_learning_rate", "clip_coef", "max_grad_norm", "checkpoint_interval"}
+MAY_CHANGE = {"run_dir", "resume", "capture_video", "track"}  # when a run is resumed
+
+
+# --- environment ----------------------------------------------------------------------------------
+
+
+class NormalizeObservation(VectorWrapper):
+    """(obs - mean) / std by running statistics, clipped; maps `final_obs` too.
+
+    Gymnasium's own refuses SAME_STEP autoreset. The statistics belong to the caller: they outlive
+    the environments, go into checkpoints, and stay as they are with `update=False`.
+    """
+
+    def __init__(
+        self, env: VectorEnv, rms: RunningMeanStd, clip: float = 10.0, update: bool = True
+    ) -> None:
+        super().__init__(env)
+        self.rms, self.clip, self.update = rms, clip, update
+        box = gym.spaces.Box(-clip, clip, env.single_observation_space.shape, np.float32)
+        self.single_observation_space = box
+        self.observation_space = gym.vector.utils.batch_space(box, env.num_envs)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        obs, info = self.env.reset(seed=seed, options=options)
+        return self.observe(obs), info
+
+    def step(self, actions: np.ndarray) -> tuple:
+        obs, rewards, terminations, truncations, info = self.env.step(actions)
+        for i in np.flatnonzero(info.get("_final_obs", ())):
+            info["final_obs"][i] = self.normalize(info["final_obs"][i])
+        return self.observe(obs), rewards, terminations, truncations, info
+
+    def observe(self, obs: np.ndarray) -> np.ndarray:
+        if self.update:
+            self.rms.update(obs)
+        return self.normalize(obs)
+
+    def normalize(self, obs: np.ndarray) -> np.ndarray:
+        scaled = (obs - self.rms.mean) / np.sqrt(self.rms.var + 1e-8)
+        return np.clip(scaled, -self.clip, self.clip).astype(np.float32)
+
+
+def make_env(args: Args, index: int, checkpoint: int) -> gym.Env:
+    bullet = "Bullet" in args.env_id and ":" not in args.env_id
+    env_id = f"pybullet_envs_gymnasium:{args.env_id}" if bullet else args.env_id
+    video = args.capture_video and index == 0
+    env = gym.make(env_id, **({"render_mode": "rgb_array"} if video else {}))
+    if not isinstance(env.action_space, gym.spaces.Box):
+        raise ValueError(f"env_id must name a task with a Box of actions, got {env.action_space}")
+    if video:
+        folder, prefix = str(args.path / "videos"), f"checkpoint-{checkpoint}"
+        env = gym.wrappers.RecordVideo(env, folder, name_prefix=prefix)
+    flat = len(env.observation_space.shape or ()) == 1
+    return env if flat else gym.wrappers.FlattenObservation(env)
+
+
+def make_envs(args: Args, checkpoint: int, stats: dict[str, RunningMeanStd]) -> VectorEnv:
+    """The environments until the next checkpoint, with `stats` to normalize by (filled if empty).
+
+    The state of a simulator cannot be saved. So every run builds its environments anew at each
+    scheduled checkpoint, and an interrupted run sees the same episodes as an undisturbed one.
+    """
+    makers = [functools.partial(make_env, args, i, checkpoint) for i in range(args.num_envs)]
+    envs: VectorEnv = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
+    envs = RecordEpisodeStatistics(envs)
+    if args.norm_obs:
+        shape = envs.single_observation_space.shape
+        envs = NormalizeObservation(envs, stats.setdefault("obs_rms", RunningMeanStd(shape=shape)))
+    if args.norm_reward:
+        envs = NormalizeReward(envs, gamma=args.gamma)
+        envs.return_rms = stats.setdefault("return_rms", envs.return_rms)
+    if args.perturb_obs:  # condwrap
+        envs = VectorPerturbObservation(envs, args.perturbation, args.radius)  # condwrap
+    return envs
+
+
+def env_seeds(args: Args, checkpoint: int) -> list[int]:
+    sequence = np.random.SeedSequence((args.seed, args.agent, checkpoint))
+    return sequence.generate_state(args.num_envs).tolist()
+
+
+# --- agent ----------------------------------------------------------------------------------------
+
+
+def make_mlp(sizes: tuple[int, ...], last_gain: float, generator: torch.Generator) -> nn.Sequential:
+    """Tanh layers with orthogonal weights, drawn from the generator and no global state."""
+    layers: list[nn.Module] = []
+    for n_in, n_out in itertools.pairwise(sizes):
+        linear = nn.utils.skip_init(nn.Linear, n_in, n_out)
+        nn.init.orthogonal_(linear.weight, math.sqrt(2), generator)
+        nn.init.zeros_(linear.bias)
+        layers += [linear, nn.Tanh()]
+    with torch.no_grad():
+        layers[-2].weight *= last_gain / math.sqrt(2)
+    return nn.Sequential(*layers[:-1])
+
+
+class Actor(nn.Module):
+    """Gaussian policy: a mean for each observation, one log-std for each action."""
+
+    def __init__(self, sizes: tuple[int, ...], generator: torch.Generator) -> None:
+        super().__init__()
+        self.mean = make_mlp(sizes, 0.01, generator)
+        self.log_std = nn.Parameter(torch.zeros(sizes[-1]))
+
+    def forward(self, obs: Tensor) -> Independent:
+        mean = self.mean(obs)
+        normal = Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False)
+        return Independent(normal, 1, validate_args=False)
+
+
+# --- PPO ------------------------------------------------------------------------------------------
+
+
+class Rollout(NamedTuple):
+    """T steps of N environments, and what they led to."""
+
+    obs: Tensor  # [T, N, obs_dim]
+    actions: Tensor  # [T, N, action_dim], before they are clipped to the action space
+    rewards: Tensor  # [T, N], scaled for learning
+    dones: Tensor  # [T, N], 1 where an episode ended or was cut
+    values: Tensor  # [T, N]
+    next_values: Tensor  # [T, N], V of what the step led to: 0 at an end, V(final_obs) at a cut
+    next_obs: np.ndarray  # [N, obs_dim]
+    returns: list[float]  # of the episodes that ended, in raw rewards
+    lengths: list[int]
+
+
+@torch.no_grad()
+def rollout(args: Args, learner: Learner, envs: VectorEnv, next_obs: np.ndarray) -> Rollout:
+    """Step the environments; autoreset is in the same step, so every transition counts."""
+    actor, critic, space = learner.actor, learner.critic, envs.single_action_space
+    shape = (args.num_steps, envs.num_envs)
+    obs = np.empty((*shape, next_obs.shape[-1]), np.float32)
+    rewards, dones = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    noise = torch.randn((*shape, *space.shape), generator=learner.generators["action"])
+    actions = noise * actor.log_std.exp()
+    final_obs: dict[tuple[int, int], np.ndarray] = {}  # what truncated episodes showed last
+    returns: list[float] = []
+    lengths: list[int] = []
+    for t in range(args.num_steps):
+        obs[t] = next_obs
+        actions[t] += actor.mean(torch.from_numpy(obs[t]))
+        clipped = np.clip(actions[t].numpy(), space.low, space.high)
+        next_obs, rewards[t], terminated, truncated, info = envs.step(clipped)
+        dones[t] = terminated | truncated
+        if "episode" in info:
+            returns += info["episode"]["r"][info["_episode"]].tolist()
+            lengths += info["episode"]["l"][info["_episode"]].tolist()
+        for i in np.flatnonzero(truncated & ~terminated):  # termination wins
+            final_obs[t, i] = info["final_obs"][i]
+    states = torch.from_numpy(np.concatenate([obs, next_obs[None]], dtype=np.float32))
+    values = critic(states).squeeze(-1)  # [T + 1, N]
+    next_values = values[1:] * (1 - torch.from_numpy(dones))
+    for (t, i), last in final_obs.items():
+        next_values[t, i] = critic(torch.from_numpy(np.asarray(last, np.float32)))
+    return Rollout(states[:-1], actions, torch.from_numpy(rewards), torch.from_numpy(dones),
+                   values[:-1], next_values, next_obs, returns, lengths)  # fmt: skip
+
+
+def gae(data: Rollout, gamma: float, gae_lambda: float) -> Tensor:
+    """Generalized advantage estimation (Schulman et al., 2016, arXiv 1506.02438), `[T, N]`.
+
+    A_t = d_t + gamma · lambda · (1 - done_t) · A_{t+1},  d_t = r_t + gamma · next_value_t - V_t
+    """
+    errors = (data.rewards + gamma * data.next_values - data.values).numpy()
+    decays = (gamma * gae_lambda * (1 - data.dones)).numpy()
+    advantages, advantage = np.empty_like(errors), np.zeros_like(errors[0])
+    for t in reversed(range(len(errors))):
+        advantages[t] = advantage = errors[t] + decays[t] * advantage
+    return torch.from_numpy(advantages)
+
+
+def policy_loss(logratio: Tensor, advantages: Tensor, clip_coef: float) -> tuple[Tensor, ...]:
+    """-L_CLIP, the KL estimate E[ratio - 1 - log ratio], and the share of clipped samples."""
+    advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+    ratio = logratio.exp()
+    clipped = ratio.clamp(1 - clip_coef, 1 + clip_coef)
+    loss = -torch.min(advantages * ratio, advantages * clipped).mean()
+    with torch.no_grad():
+        return loss, (ratio - 1 - logratio).mean(), (ratio != clipped).float().mean()
+
+
+def step(optimizer: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float) -> None:
+    optimizer.zero_grad()
+    loss.backward()
+    nn.utils.clip_grad_norm_(optimizer.param_groups[0]["params"], max_grad_norm)
+    optimizer.step()
+
+
+def update(args: Args, learner: Learner, data: Rollout) -> dict[str, float]:
+    """Epochs of minibatches over one rollout: equation (3) of the paper, minimized.
+
+    The paper maximizes L_CLIP + c1·psi - c2·L_VF + c3·entropy, which would reward bad conditioning;
+    its text says penalty. So -L_CLIP + c1·mean(psi) + c2·L_VF - c3·entropy is minimized here, the
+    policy's terms and the critic's each by an optimizer of their own, since they share no weights.
+    """
+    actor, critic = learner.actor, learner.critic
+    obs, actions = data.obs.flatten(0, 1), data.actions.flatten(0, 1)
+    advantages = gae(data, args.gamma, args.gae_lambda).flatten()
+    values = data.values.flatten()
+    targets = advantages + values
+    with torch.no_grad():
+        old_logprobs = actor(obs).log_prob(actions)
+    policy_logs, value_losses, policy_learns = [], [], True
+    for epoch in range(max(args.update_epochs, args.vf_epochs)):
+        policy_learns = policy_learns and epoch < args.update_epochs
+        order = torch.randperm(len(obs), generator=learner.generators["minibatch"])
+        for i in order.split(len(obs) // args.num_minibatches):
+            if policy_learns:
+                policy = actor(obs[i])
+                logratio = policy.log_prob(actions[i]) - old_logprobs[i]
+                pg_loss, kl, clipfrac = policy_loss(logratio, advantages[i], args.clip_coef)
+                entropy = policy.entropy().mean()
+                loss = pg_loss - args.ent_coef * entropy
+                if args.coefficient > 0:  # condwrap
+                    loss = loss + learner.regularizer(actor, obs[i]).penalty  # condwrap
+                step(learner.actor_optimizer, loss, args.max_grad_norm)
+                policy_logs.append(torch.stack([pg_loss, entropy, kl, clipfrac]).detach())
+            if epoch < args.vf_epochs:
+                value_loss = (critic(obs[i]).squeeze(-1) - targets[i]).square().mean()
+                step(learner.critic_optimizer, args.vf_coef * value_loss, args.max_grad_norm)
+                value_losses.append(value_loss.detach())
+        if policy_learns and args.target_kl is not None:
+            epoch_kl = torch.stack(policy_logs[-args.num_minibatches :])[:, 2].mean()
+            policy_learns = bool(epoch_kl <= args.target_kl)
+    names = ("policy_loss", "entropy", "approx_kl", "clipfrac", "value_loss", "explained_variance")
+    explained = 1 - (targets - values).var() / targets.var()
+    logs = [*torch.stack(policy_logs).mean(0), torch.stack(value_losses).mean(), explained]
+    return {f"losses/{name}": x.item() for name, x in zip(names, logs, strict=True)}
+
+
+def measure_conditioning(learner: Learner, obs: Tensor) -> dict[str, float]:  # condwrap
+    """How the new policy is conditioned on the whole rollout: one rule in every run."""  # condwrap
+    measured = learner.probe(learner.actor, obs.flatten(0, 1))  # condwrap
+    quantiles = measured.quotient.quantile(torch.tensor([0.05, 0.5, 0.95]))  # condwrap
+    names = ("quotient_q05", "quotient_q50", "quotient_q95")  # condwrap
+    logs = dict(zip(names, quantiles, strict=True))  # condwrap
+    logs["psi"] = measured.psi.mean()  # condwrap
+    logs["fraction_below"] = measured.fraction_below  # condwrap
+    logs["fraction_above"] = measured.fraction_above  # condwrap
+    return {f"conditioning/{name}": x.item() for name, x in logs.items()}  # condwrap
+
+
+# --- state and files ------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass
+class Learner:
+    """All that changes while training, and so all that a checkpoint holds."""
+
+    actor: Actor
+    critic: nn.Module
+    actor_optimizer: torch.optim.Optimizer
+    critic_optimizer: torch.optim.Optimizer
+    generators: dict[str, torch.Generator]
+    stats: dict[str, RunningMeanStd]
+    regularizer: ConditioningRegularizer  # condwrap
+    probe: ConditioningRegularizer  # condwrap
+    update: int = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        state: dict[str, Any] = {name: getattr(self, name).state_dict() for name in TRAINED}
+        for name, rms in self.stats.items():
+            moments = vars(rms).items()
+            state[name] = {key: torch.tensor(x, dtype=torch.float64) for key, x in moments}
+        generators = {name: generator.get_state() for name, generator in self.generators.items()}
+        return {**state, "generators": generators, "update": self.update}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        for name in TRAINED:
+            getattr(self, name).load_state_dict(state[name])
+        for name, rms in self.stats.items():
+            vars(rms).update({key: x.numpy() for key, x in state[name].items()})
+        for name, generator in self.generators.items():
+            generator.set_state(state["generators"][name])
+        self.update = state["update"]
+
+
+TRAINED = ("actor", "critic", "actor_optimizer", "critic_optimizer")
+TRAINED += ("regularizer", "probe")  # condwrap
+
+
+def make_learner(args: Args) -> Learner:
+    """Everything at its start, each use of randomness with a generator of its own."""
+    stats: dict[str, RunningMeanStd] = {}
+    envs = make_envs(dataclasses.replace(args, capture_video=False), 0, stats)
+    obs_dim = math.prod(envs.single_observation_space.shape)
+    action_dim = math.prod(envs.single_action_space.shape)
+    envs.close()
+    names = ("init", "action", "minibatch", "penalty", "probe")
+    streams = np.random.SeedSequence((args.seed, args.agent)).spawn(len(names))
+    seeds = {n: int(s.generate_state(1, np.uint64)[0]) for n, s in zip(names, streams, strict=True)}
+    rngs = {n: torch.Generator().manual_seed(seeds[n]) for n in ("init", "action", "minibatch")}
+    measuring = {**args.conditioning, "coefficient": 0.0}  # condwrap
+    actor = Actor((obs_dim, *args.hidden_sizes, action_dim), rngs["init"])
+    critic = make_mlp((obs_dim, *args.hidden_sizes, 1), 1.0, rngs["init"])
+    return Learner(
+        actor=actor,
+        critic=critic,
+        actor_optimizer=torch.optim.Adam(actor.parameters(), args.learning_rate, eps=1e-5),
+        critic_optimizer=torch.optim.Adam(critic.parameters(), args.vf_learning_rate, eps=1e-5),
+        generators=rngs,
+        stats=stats,
+        regularizer=ConditioningRegularizer(**args.conditioning, seed=seeds["penalty"]),  # condwrap
+        probe=ConditioningRegularizer(**measuring, seed=seeds["probe"]),  # condwrap
+    )
+
+
+def write_metrics(args: Args, writer: SummaryWriter, row: dict[str, float]) -> None:
+    """A row of metrics.csv for each update, and the same numbers as TensorBoard scalars."""
+    with open(args.path / "metrics.csv", "a", newline="") as file:
+        table = csv.DictWriter(file, row)
+        if file.tell() == 0:
+            table.writeheader()
+        table.writerow(row)
+    for name, value in row.items():
+        if not math.isnan(value):
+            writer.add_scalar(name, value, int(row["global_step"]))
+
+
+def save_checkpoint(args: Args, learner: Learner) -> None:
+    """Write a temporary file, then rename: a whole checkpoint is there whatever happens."""
+    with open(args.path / "metrics.csv", "rb") as metrics:
+        os.fsync(metrics.fileno())
+        size = os.fstat(metrics.fileno()).st_size
+    settings = {k: v for k, v in vars(args).items() if k not in MAY_CHANGE}
+    path = args.path / "checkpoint.pt"
+    with open(path.with_suffix(".tmp"), "wb") as file:
+        torch.save({"args": settings, "learner": learner.state_dict(), "metrics_size": size}, file)
+        file.flush()
+        os.fsync(file.fileno())
+    if path.exists():
+        path.replace(path.with_suffix(".previous.pt"))
+    path.with_suffix(".tmp").replace(path)
+
+
+def load_checkpoint(args: Args) -> dict[str, Any] | None:
+    """The newest checkpoint that can be read, if the run may be resumed and there is one."""
+    path = args.path / "checkpoint.pt"
+    found = [p for p in (path, path.with_suffix(".previous.pt")) if p.exists()]
+    if found and not args.resume:
+        raise ValueError(f"{args.path} holds a run: --resume it, or name another --run-dir")
+    for candidate in found:
+        try:
+            saved = torch.load(candidate, weights_only=True)
+        except Exception as error:  # whatever a torn file makes the reader stumble over
+            print(f"{candidate} cannot be read: {error!r}")
+            continue
+        for name, value in saved["args"].items():
+            if value != vars(args)[name]:
+                raise ValueError(f"{args.path} was run with {name}={value}, not {vars(args)[name]}")
+        return saved
+    if found:
+        raise ValueError(f"{args.path} holds no readable checkpoint: remove it to start anew")
+    return None
+
+
+# --- training ------------------------------------------------------------------------------------
+
+
+def train(args: Args) -> Learner:
+    """Train, or continue to train, until `total_timesteps`."""
+    args.path.mkdir(parents=True, exist_ok=True)
+    saved = load_checkpoint(args)
+    learner = make_learner(args)
+    if saved:
+        learner.load_state_dict(saved["learner"])
+    first, started, printed = learner.update, time.time(), -math.inf
+    with open(args.path / "metrics.csv", "a") as metrics:
+        metrics.truncate(saved["metrics_size"] if saved else 0)  # later rows are computed again
+    writer = SummaryWriter(str(args.path), purge_step=first * args.batch_size or None)
+    rows = "".join(f"\n|{name}|{value}|" for name, value in vars(args).items())
+    writer.add_text("hyperparameters", f"|parameter|value|\n|-|-|{rows}")
+    envs: VectorEnv | None = None
+    while learner.update < args.num_updates:
+        checkpoint, updates_since = divmod(learner.update, args.checkpoint_interval)
+        if envs is None or updates_since == 0:
+            if envs is not None:
+                envs.close()
+                save_checkpoint(args, learner)
+            envs = make_envs(args, checkpoint, learner.stats)
+            next_obs, _ = envs.reset(seed=env_seeds(args, checkpoint))
+        if args.anneal_lr:
+            left = 1 - learner.update / args.num_updates
+            learner.actor_optimizer.param_groups[0]["lr"] = left * args.learning_rate
+            learner.critic_optimizer.param_groups[0]["lr"] = left * args.vf_learning_rate
+        data = rollout(args, learner, envs, next_obs)
+        next_obs = data.next_obs
+        losses = update(args, learner, data)
+        learner.update += 1
+        speed = (learner.update - first) * args.batch_size / (time.time() - started)
+        row = {
+            "global_step": learner.update * args.batch_size,
+            "charts/episodic_return": float(np.mean(data.returns)) if data.returns else math.nan,
+            "charts/episodic_length": float(np.mean(data.lengths)) if data.lengths else math.nan,
+            "charts/SPS": speed,
+            **losses,
+            **measure_conditioning(learner, data.obs),  # condwrap
+        }
+        write_metrics(args, writer, row)
+        if time.time() - printed > 10 or learner.update == args.num_updates:
+            printed = time.time()
+            minutes = (args.num_updates - learner.update) * args.batch_size / speed / 60
+            print(f"update {learner.update}/{args.num_updates}", end="  ")
+            print(f"return {row['charts/episodic_return']:.1f}", end="  ")
+            print(f"{speed:.0f} steps/s  {minutes:.1f} min left")
+    if envs is not None:
+        envs.close()
+        save_checkpoint(args, learner)
+    writer.close()
+    return learner
+
+
+def main() -> None:
+    torch.set_num_threads(1)  # more do not pay for networks of this size
+    sys.stdout.reconfigure(line_buffering=True)  # progress shows in a log file too
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        args = tyro.cli(Args, description=__doc__)
+        if args.track:
+            import wandb
+
+            wandb.init(name=args.path.name, config=vars(args), sync_tensorboard=True)
+        train(args)
+    except ValueError as error:
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit("interrupted: --resume continues from the last checkpoint")
+
+
+if __name__ == "__main__":
+    main()

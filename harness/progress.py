@@ -1,0 +1,87 @@
+"""What run-all shows while it works: a live bar on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+
+import rich.progress
+from rich.console import Console
+
+from harness.store import Store
+from harness.suite import RunSpec
+
+PLAIN_INTERVAL = 30.0  # seconds between two lines where there is no terminal
+LIVE_INTERVAL = 0.5
+
+
+class Progress:
+    """Runs done, environment steps, steps/s and time left, over all runs of a plan.
+
+    Steps are read from the runs' own metrics.csv, so they grow by an update at a time.
+    """
+
+    def __init__(self, console: Console, store: Store, specs: list[RunSpec]) -> None:
+        self.console, self.store, self.specs = console, store, specs
+        self.steps = {spec.run_id: store.steps(spec) for spec in specs}
+        self.total = sum(spec.args["total_timesteps"] for spec in specs)
+        self.first, self.started = sum(self.steps.values()), time.monotonic()
+        self.ended_runs, self.shown = 0, 0.0
+        self.bar = rich.progress.Progress(
+            rich.progress.TextColumn("{task.description}"),
+            rich.progress.BarColumn(),
+            rich.progress.TaskProgressColumn(),
+            rich.progress.TextColumn("{task.fields[speed]}"),
+            rich.progress.TimeElapsedColumn(),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self.task = self.bar.add_task("", total=self.total, completed=self.first, speed="")
+
+    def __enter__(self) -> Progress:
+        self.bar.__enter__()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.bar.__exit__(kind, error, traceback)
+
+    def ended(self, spec: RunSpec, how: str) -> None:
+        """Say that a run is over."""
+        self.ended_runs += 1
+        self.steps[spec.run_id] = self.store.steps(spec)
+        number = f"[{self.ended_runs}/{len(self.specs)}]"
+        self.bar.console.print(f"{number} {spec.run_id}  {how}", highlight=False, markup=False)
+
+    def update(self, running: list[RunSpec]) -> None:
+        """Show how far all is, at most every half second, or every half minute in plain lines."""
+        now = time.monotonic()
+        interval = LIVE_INTERVAL if self.console.is_terminal else PLAIN_INTERVAL
+        if now - max(self.shown, self.started) < interval:
+            return
+        self.shown = now
+        self.steps |= {spec.run_id: self.store.steps(spec) for spec in running}
+        done = sum(self.steps.values())
+        rate = (done - self.first) / (now - self.started)
+        left = f"{duration((self.total - done) / rate)} left" if rate else "starting"
+        what, speed = f"{self.ended_runs}/{len(self.specs)} runs", f"{rate:,.0f} steps/s, {left}"
+        self.bar.update(self.task, completed=done, description=what, speed=speed)
+        if not self.console.is_terminal:
+            percent = f"{100 * done / self.total:.0f}%"
+            self.console.print(f"{what}  {percent}  {speed}", highlight=False)
+
+
+def duration(seconds: float) -> str:
+    """Seconds as a person would say them: "40 s", "12 min", "3.5 h", "9 days"."""
+    for limit, unit, name, digits in (
+        (90, 1, "s", 0),
+        (5400, 60, "min", 0),
+        (172800, 3600, "h", 1),
+    ):
+        if seconds < limit:
+            return f"{seconds / unit:.{digits}f} {name}"
+    return f"{seconds / 86400:,.0f} days"

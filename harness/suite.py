@@ -1,0 +1,180 @@
+"""A suite of experiments: a TOML file, turned into runs that are checked before any starts."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import hashlib
+import importlib
+import json
+import re
+import tomllib
+import types
+import typing
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+SUITES = Path(__file__).parent / "suites"
+KEYS = {"title", "note", "reports", "seeds", "agents", "args", "algorithms", "environments"}
+
+
+class SuiteError(ValueError):
+    """A suite that cannot be run, and why."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RunSpec:
+    """One run of one baseline; what `args` does not name has the baseline's default."""
+
+    suite: str
+    algorithm: str
+    """the name in the tables, such as "PPO reg" """
+    environment: str
+    """the name in the tables, such as "Hopper" """
+    baseline: str
+    """module in baselines/"""
+    args: dict[str, Any]
+    """of the baseline: env_id, seed, agent, total_timesteps, and what the suite sets"""
+
+    @property
+    def run_id(self) -> str:
+        algorithm = re.sub(r"\W+", "-", self.algorithm.lower())
+        return f"{algorithm}__{self.environment}__s{self.args['seed']}__a{self.args['agent']}"
+
+    @property
+    def hash(self) -> str:
+        """Tells a changed configuration from a finished one."""
+        content = json.dumps([self.baseline, self.args], sort_keys=True)
+        return hashlib.sha256(content.encode()).hexdigest()
+
+    @property
+    def flags(self) -> list[str]:
+        """The baseline's command-line arguments."""
+        flags: list[str] = []
+        for name, value in self.args.items():
+            flag = name.replace("_", "-")
+            if isinstance(value, bool):
+                flags.append(f"--{flag}" if value else f"--no-{flag}")
+            else:
+                values = value if isinstance(value, list) else [value]
+                flags += [f"--{flag}", *map(str, values)]
+        return flags
+
+
+@dataclasses.dataclass(frozen=True)
+class Suite:
+    """A named set of runs and the reports that they feed."""
+
+    name: str
+    title: str
+    note: str
+    reports: list[str]
+    algorithms: list[str]
+    environments: list[str]
+    runs: list[RunSpec]
+
+    @property
+    def timesteps(self) -> int:
+        return sum(run.args["total_timesteps"] for run in self.runs)
+
+
+def suite_names() -> list[str]:
+    return sorted(path.stem for path in SUITES.glob("*.toml"))
+
+
+def load_suite(
+    name: str,
+    *,
+    total_timesteps: int | None = None,
+    seeds: int | None = None,
+    agents: int | None = None,
+    env: tuple[str, ...] = (),
+) -> Suite:
+    """Read a suite and check every run against its baseline's `Args`.
+
+    Args:
+        name: The name of a file in harness/suites, or the path of a TOML file.
+        total_timesteps: Environment steps of each run, instead of the suite's.
+        seeds: Take only the first so many seeds.
+        agents: Train only so many agents for each seed.
+        env: Take only these environments, by the names that the tables use.
+
+    Raises:
+        SuiteError: An unknown suite, environment, baseline or argument, or a bad value.
+    """
+    path = Path(name) if name.endswith(".toml") else SUITES / f"{name}.toml"
+    if not path.exists():
+        raise SuiteError(f"no suite {name!r}: there are {', '.join(suite_names())}")
+    try:
+        data = tomllib.loads(path.read_text())
+    except tomllib.TOMLDecodeError as error:
+        raise SuiteError(f"{path} is not valid TOML: {error}") from error
+    _known(data, KEYS, f"{path.name}: key")
+    _known(dict.fromkeys(env), set(data["environments"]), "environment")
+    environments = {k: v for k, v in data["environments"].items() if k in env or not env}
+    common = data["args"] | ({"total_timesteps": total_timesteps} if total_timesteps else {})
+    runs = []
+    for algorithm in data["algorithms"]:
+        for environment, env_id in environments.items():
+            args = {"env_id": env_id, **common, **algorithm.get("args", {})}
+            where = f"{path.name}: {algorithm['name']} on {environment}"
+            check_args(algorithm["baseline"], args, where)
+            runs += [
+                RunSpec(
+                    suite=path.stem,
+                    algorithm=algorithm["name"],
+                    environment=environment,
+                    baseline=algorithm["baseline"],
+                    args={**args, "seed": seed, "agent": agent},
+                )
+                for seed in data["seeds"][:seeds]
+                for agent in range(agents or data["agents"])
+            ]
+    return Suite(
+        name=path.stem,
+        title=data["title"],
+        note=data.get("note", ""),
+        reports=data["reports"],
+        algorithms=[algorithm["name"] for algorithm in data["algorithms"]],
+        environments=list(environments),
+        runs=runs,
+    )
+
+
+def check_args(baseline: str, args: dict[str, Any], where: str) -> None:
+    """Raise SuiteError unless the baseline takes these arguments and the environment exists."""
+    try:
+        cls = importlib.import_module(f"baselines.{baseline}").Args
+    except ModuleNotFoundError as error:
+        raise SuiteError(f"{where}: baseline {baseline!r} cannot be imported: {error}") from error
+    hints = typing.get_type_hints(cls)
+    _known(args, set(hints), f"{where}: argument")
+    for name, value in args.items():
+        if not _fits(value, hints[name]):
+            raise SuiteError(f"{where}: {name} must be {hints[name]}, got {value!r}")
+    try:
+        cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in args.items()})
+        importlib.import_module("pybullet_envs_gymnasium")  # registers its tasks
+        gym.spec(args["env_id"])
+    except (ValueError, gym.error.Error, ModuleNotFoundError) as error:
+        raise SuiteError(f"{where}: {error}") from error
+
+
+def _known(given: dict[str, Any], known: set[str], what: str) -> None:
+    for name in given:
+        if name not in known:
+            close = difflib.get_close_matches(name, known, n=1) or sorted(known)
+            raise SuiteError(f"{what} {name!r} is unknown: {' or '.join(close)}?")
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    origin = typing.get_origin(hint)
+    if origin in (types.UnionType, typing.Union):
+        return any(_fits(value, option) for option in typing.get_args(hint))
+    if origin is tuple:  # TOML knows lists only
+        return isinstance(value, list) and all(_fits(x, typing.get_args(hint)[0]) for x in value)
+    if hint is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    return type(value) is hint

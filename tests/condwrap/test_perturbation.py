@@ -1,0 +1,164 @@
+"""The maps from noise to delta: lengths, distributions, libraries, bad input."""
+
+import math
+import re
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from condwrap import gaussian, sphere, uniform
+from condwrap.perturbation import get_perturbation
+
+MAPS = {"sphere": sphere, "gaussian": gaussian, "uniform": uniform}
+LIBRARIES = {"numpy": np.asarray, "torch": torch.as_tensor}
+
+every_map = pytest.mark.parametrize("name", MAPS)
+
+
+def noise(*shape, dtype=np.float64):
+    return np.random.default_rng(0).standard_normal(shape).astype(dtype)
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("sphere", [[1.2, 1.6], [0.0, -2.0]]),
+        ("gaussian", [[6.0, 8.0], [0.0, -4.0]]),
+        # erf(z / √2) is the share of a normal sample within z standard deviations
+        (
+            "uniform",
+            [[2 * 0.9973002039367398, 2 * 0.9999366575163338], [0.0, -2 * 0.9544997361036416]],
+        ),
+    ],
+)
+def test_delta_worked_out_by_hand(library, name, expected):
+    z = LIBRARIES[library](np.array([[3.0, 4.0], [0.0, -2.0]]))
+    delta = MAPS[name](z, radius=2.0)
+    assert isinstance(delta, type(z))
+    np.testing.assert_allclose(np.asarray(delta), expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize("radius", [1e-3, 1.0, 7.0])
+def test_sphere_has_length_radius_on_any_leading_axes(radius):
+    delta = sphere(noise(3, 4, 5), radius)
+    np.testing.assert_allclose(np.linalg.norm(delta, axis=-1), np.full((3, 4), radius))
+
+
+def test_sphere_keeps_the_direction_of_the_noise():
+    z = noise(20, 5)
+    cosine = (z * sphere(z)).sum(-1) / np.linalg.norm(z, axis=-1)
+    np.testing.assert_allclose(cosine, np.ones(20))
+
+
+def test_uniform_is_within_radius():
+    delta = uniform(noise(1000, 3), radius=0.5)
+    assert (np.abs(delta) < 0.5).all()
+    assert np.abs(delta).max() > 0.49
+
+
+@pytest.mark.parametrize(
+    ("name", "distribution"),
+    [
+        # a coordinate of a point on the 2-sphere is uniform (Archimedes)
+        ("sphere", stats.uniform(-2, 4)),
+        ("gaussian", stats.norm(0, 2)),
+        ("uniform", stats.uniform(-2, 4)),
+    ],
+)
+def test_coordinates_follow_their_distribution(name, distribution):
+    coordinates = MAPS[name](noise(5000, 3), radius=2.0)
+    for axis in range(3):
+        assert stats.kstest(coordinates[:, axis], distribution.cdf).pvalue > 0.01
+
+
+def test_gaussian_has_standard_deviation_radius():
+    assert gaussian(noise(20_000), radius=3.0).std() == pytest.approx(3.0, rel=0.02)
+
+
+@every_map
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_dtype_and_shape_are_kept(name, dtype, library):
+    z = LIBRARIES[library](noise(2, 3, dtype=dtype))
+    delta = MAPS[name](z, radius=0.1)
+    assert delta.dtype == z.dtype
+    assert delta.shape == z.shape
+
+
+@every_map
+@pytest.mark.parametrize(("dtype", "rtol"), [("float32", 1e-5), ("float64", 1e-13)])
+def test_numpy_and_torch_agree(name, dtype, rtol):
+    z = noise(50, 3, dtype=dtype)
+    from_torch = MAPS[name](torch.from_numpy(z), radius=0.3)
+    np.testing.assert_allclose(MAPS[name](z, radius=0.3), from_torch, rtol=rtol)
+
+
+@pytest.mark.parametrize("name", ["sphere", "gaussian"])
+def test_jax_agrees_with_numpy(name):
+    z = noise(50, 3, dtype="float32")
+    delta = MAPS[name](jnp.asarray(z), radius=0.3)
+    np.testing.assert_allclose(delta, MAPS[name](z, radius=0.3), rtol=1e-5)
+
+
+@every_map
+def test_noise_is_left_as_it_was(name):
+    z = noise(4, 3)
+    MAPS[name](z, radius=2.0)
+    np.testing.assert_array_equal(z, noise(4, 3))
+
+
+@every_map
+def test_names_give_the_maps(name):
+    z = noise(4, 3)
+    np.testing.assert_array_equal(get_perturbation(name, 0.2)(z), MAPS[name](z, 0.2))
+
+
+def test_a_callable_is_returned_as_it_is():
+    def own(z):
+        return z
+
+    assert get_perturbation(own, 1.0) is own
+
+
+@every_map
+@pytest.mark.parametrize("radius", [0.0, -1.0, math.nan, math.inf])
+def test_a_radius_must_be_finite_and_above_0(name, radius):
+    message = f"radius must be finite and above 0, got {radius}"
+    with pytest.raises(ValueError, match=message):
+        MAPS[name](noise(4, 3), radius)
+    with pytest.raises(ValueError, match=message):
+        get_perturbation(name, radius)
+
+
+@every_map
+def test_integer_noise_is_refused(name):
+    with pytest.raises(TypeError, match="noise must be floating, got int64"):
+        MAPS[name](np.array([[3, 4]]))
+
+
+def test_uniform_refuses_other_libraries():
+    with pytest.raises(TypeError, match="a NumPy array or a PyTorch tensor, got list"):
+        uniform([0.1, 0.2])
+
+
+@pytest.mark.parametrize(
+    ("perturbation", "radius", "error", "message"),
+    [
+        (
+            "cube",
+            1.0,
+            ValueError,
+            "perturbation must be one of ['gaussian', 'sphere', 'uniform'] or a callable "
+            "noise -> delta, got 'cube'",
+        ),
+        (3, 1.0, TypeError, "perturbation must be a name or a callable, got int"),
+        (sphere, 2.0, ValueError, "radius=2.0 goes with a named perturbation"),
+    ],
+)
+def test_get_perturbation_refuses(perturbation, radius, error, message):
+    with pytest.raises(error, match=re.escape(message)):
+        get_perturbation(perturbation, radius)
