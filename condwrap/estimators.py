@@ -48,10 +48,10 @@ def jvp(policy: Policy, respond: Respond, states: States, delta: Tensor) -> tupl
                 tuple(states.perturbed),
                 tuple(states.displacement(delta)),
             )[1]
-    except (RuntimeError, NotImplementedError) as error:
-        raise type(error)(
-            f"estimator='jvp' cannot differentiate this policy forward ({error}). Flash attention "
-            "has no forward mode: use torch.nn.attention.sdpa_kernel(SDPBackend.MATH), or "
+    except NotImplementedError as error:
+        raise NotImplementedError(
+            f"estimator='jvp' needs forward-mode differentiation, which the policy lacks: {error}. "
+            "For attention use torch.nn.attention.sdpa_kernel(SDPBackend.MATH), for anything else "
             "estimator='difference'"
         ) from error
     return change, torch.zeros_like(change)

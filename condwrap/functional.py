@@ -46,7 +46,7 @@ def conditioning_quotient(
         >>> conditioning_quotient(mean, perturbed_mean, delta=np.array([[0.0, 0.0, 2.0]]))
         array([2.5])
     """
-    xp = _namespace(output=output, perturbed_output=perturbed_output, delta=delta)
+    xp = namespace(output=output, perturbed_output=perturbed_output, delta=delta)
     if output.shape != perturbed_output.shape:
         raise ValueError(
             f"output and perturbed_output need the same shape, got {tuple(output.shape)} "
@@ -92,7 +92,7 @@ def clamping_penalty(quotient: Array, lambda_min: float = 1.0, lambda_max: float
         >>> clamping_penalty(np.array([0.5, 1.0, 7.0, 20.0, 23.0]))
         array([0.25, 0.  , 0.  , 0.  , 9.  ])
     """
-    xp = _namespace(quotient=quotient)
+    xp = namespace(quotient=quotient)
     check_range(lambda_min, lambda_max)
     return (quotient - xp.clip(quotient, lambda_min, lambda_max)) ** 2
 
@@ -108,7 +108,7 @@ def check_range(lambda_min: float, lambda_max: float) -> None:
 
 def safe_norm(x: Array) -> Array:
     """Euclidean norm over the last axis, `[..., n]` to `[...]`, with gradient 0 at 0."""
-    xp = _namespace(x=x)
+    xp = namespace(x=x)
     squares = xp.sum(x * x, axis=-1)
     positive = squares > 0
     # Two `where`s: with one alone, JAX multiplies the infinite slope of sqrt at 0 by 0.
@@ -121,7 +121,7 @@ def _flatten(xp: Any, x: Array, batch_ndim: int) -> Array:
     return xp.reshape(x, (*x.shape[:batch_ndim], math.prod(x.shape[batch_ndim:])))
 
 
-def _namespace(**arrays: Array) -> Any:
+def namespace(**arrays: Array) -> Any:
     """The Array API namespace that all the named arrays share, their dtypes checked."""
     if all(isinstance(x, torch.Tensor) for x in arrays.values()):
         xp = array_api_compat.torch  # found without the look-up, which dynamo traces with warnings

@@ -37,6 +37,9 @@ class States:
                 raise TypeError(
                     f"obs must be a Tensor or a dict of Tensors, got {type(leaf).__name__}"
                 )
+        if leaves and torch.is_autocast_enabled(leaves[0].device.type):  # J is taken in float32
+            half = (torch.bfloat16, torch.float16)
+            leaves = [leaf.float() if leaf.dtype in half else leaf for leaf in leaves]
         scales = [_scale(leaf.dtype, obs_scale) for leaf in leaves]
         if not any(scales):
             kinds = ", ".join(str(leaf.dtype) for leaf in leaves) or "no tensor"
@@ -88,7 +91,7 @@ class States:
     def subset(self, fraction: float) -> States:
         """ceil(fraction · B) states, evenly spaced along the first axis."""
         size = self.leaves[0].shape[0]
-        count = math.ceil(fraction * size)
+        count = math.ceil(fraction * size - 1e-9)  # 0.55 · 100 is 55.00000000000001
         if count == size:
             return self
         index = torch.arange(count, device=self.device) * size // count
@@ -116,16 +119,19 @@ class States:
 
     def flatten(self, delta: Any) -> Tensor:
         """A delta in the observation's structure, checked, as `[*batch, n]`."""
-        got = pytree.tree_leaves(delta)
-        leaves = zip(self.leaves, self.scales, strict=True)
-        want = [tuple(x.shape) if scale else None for x, scale in leaves]
-        if [tuple(x.shape) if isinstance(x, Tensor) else x for x in got] != want:
+        try:
+            leaves = self.spec.flatten_up_to(delta)  # a dict by its keys, not by their order
+        except ValueError:
+            leaves = pytree.tree_leaves(delta)
+        got = [_shape(x) for x in leaves]
+        perturbed = zip(self.leaves, self.scales, strict=True)
+        want = [tuple(x.shape) if scale else None for x, scale in perturbed]
+        if got != want:
             raise ValueError(
-                f"delta must match the perturbed states, leaves of shape {want}, got "
-                f"{[tuple(x.shape) if isinstance(x, Tensor) else x for x in got]}: "
+                f"delta must match the perturbed states, leaves of shape {want}, got {got}: "
                 "sample_delta(obs) draws one that does"
             )
-        parts = [x.reshape(*self.batch, -1) for x in got if x is not None]
+        parts = [x.reshape(*self.batch, -1) for x in leaves if x is not None]
         if not all(x.is_floating_point() for x in parts):
             raise TypeError(f"delta must be floating, got {[str(x.dtype) for x in parts]}")
         return torch.cat(parts, -1)
@@ -133,5 +139,13 @@ class States:
 
 def _scale(dtype: torch.dtype, obs_scale: float | None) -> float | None:
     if dtype.is_floating_point:
-        return obs_scale or 1.0
+        return 1.0
+    if dtype == torch.bool:
+        return None
     return IMAGE_SCALE if dtype == torch.uint8 and obs_scale is None else obs_scale
+
+
+def _shape(x: Any) -> tuple[int, ...] | str | None:
+    if isinstance(x, Tensor):
+        return tuple(x.shape)
+    return None if x is None else type(x).__name__

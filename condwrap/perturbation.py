@@ -16,7 +16,7 @@ from typing import Any
 import array_api_compat
 import torch
 
-from condwrap.functional import Array, safe_norm
+from condwrap.functional import Array, namespace, safe_norm
 
 Perturbation = Callable[[Any], Any]  # noise [..., n] -> delta [..., n]
 
@@ -43,6 +43,7 @@ def sphere(noise: Array, radius: float = 1.0) -> Array:
         array([[1.2, 1.6]])
     """
     check_radius(radius)
+    namespace(noise=noise)
     return noise * (radius / safe_norm(noise))[..., None]
 
 
@@ -65,6 +66,7 @@ def gaussian(noise: Array, radius: float = 1.0) -> Array:
         array([[1.5, 2. ]])
     """
     check_radius(radius)
+    namespace(noise=noise)
     return noise * radius
 
 
@@ -90,6 +92,7 @@ def uniform(noise: Array, radius: float = 1.0) -> Array:
         array([[0., 2.]])
     """
     check_radius(radius)
+    namespace(noise=noise)
     if isinstance(noise, torch.Tensor):
         return radius * torch.erf(noise / math.sqrt(2))
     if array_api_compat.is_numpy_array(noise):  # NumPy has no erf

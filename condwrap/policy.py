@@ -102,8 +102,11 @@ def _parameter(distribution: td.Distribution, output: str) -> Tensor:
         output = (
             "mean" if isinstance(base, _MEAN) else "logits" if isinstance(base, _LOGITS) else ""
         )
-    value = getattr(base, output, None) if output else None
-    if value is None:
+    try:
+        value = getattr(base, output, None) if output else None
+    except NotImplementedError:  # a mean that has no closed form
+        value = None
+    if value is None or (output == "mean" and isinstance(base, td.Categorical)):  # that is NaN
         raise TypeError(
             f"no {output or 'default output'} for {type(base).__name__}: "
             "pass output=lambda answer: ... to select the tensor"
@@ -144,7 +147,7 @@ def untouched(policy: Policy, device: torch.device) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _copied_buffers(modules: list[nn.Module]) -> Iterator[None]:
-    kept = [(m, dict(m._buffers)) for m in modules if m.training and m._buffers]
+    kept = [(m, dict(m._buffers)) for m in modules if m._buffers]
     for module, buffers in kept:
         module._buffers.update({k: b if b is None else b.clone() for k, b in buffers.items()})
     try:
@@ -160,6 +163,7 @@ def _reachable(policy: Any, depth: int = 2) -> Iterator[nn.Module]:
         yield policy
     elif depth and not torch.compiler.is_compiling():  # dynamo cannot look into a function
         if isinstance(policy, functools.partial):
+            depth += 1  # it only adds arguments
             held = [policy.func, *policy.args, *policy.keywords.values()]
         elif inspect.ismethod(policy):
             held = [policy.__self__]

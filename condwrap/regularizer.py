@@ -132,7 +132,8 @@ class ConditioningRegularizer:
         Args:
             policy: Any callable obs -> Tensor, Distribution, or tuple or dict of them. It is
                 called as in training; uint8 observations reach it as float32, not yet divided.
-            obs: `[*batch, *obs_shape]`, floating or uint8, or a dict of these.
+            obs: `[*batch, *obs_shape]`, floating or uint8, or a dict of these. In float32 at least:
+                bf16 would round S + delta.
             delta: A perturbation from `sample_delta` to use instead of drawing one.
 
         Raises:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import sys
@@ -21,6 +22,7 @@ from harness.suite import Suite, SuiteError, load_suite, suite_names
 
 app = tyro.extras.SubcommandApp()
 console = Console()
+say = functools.partial(console.print, highlight=False, soft_wrap=True)
 DEFAULT_SUITE = "smoke"
 
 
@@ -54,10 +56,9 @@ def run_all(
     plan = load_suite(suite, total_timesteps=total_timesteps, seeds=seeds, agents=agents, env=env)
     todo = [spec for spec in plan.runs if store.state(spec) != "done"]
     done = len(plan.runs) - len(todo)
-    console.print(
+    say(
         f"[bold]{plan.name}[/]: {plan.title}. {len(plan.runs)} runs, {plan.timesteps:,} steps; "
-        f"{done} done before, {len(todo)} to do, {jobs} at a time.",
-        highlight=False,
+        f"{done} done before, {len(todo)} to do, {jobs} at a time."
     )
     outcome = Outcome()
     if todo:
@@ -66,10 +67,10 @@ def run_all(
     make_report(plan, store)
     show_others(plan, store)
     if outcome.held:
-        console.print(f"[yellow]{len(outcome.held)} runs are being run by another process.[/]")
+        say(f"[yellow]{len(outcome.held)} runs are being run by another process.[/]")
     for spec in outcome.failed:
-        console.print(f"\n[red bold]FAILED[/] {spec.run_id}: {store.path(spec, 'log.txt')} ends")
-        console.print(store.log_tail(spec), markup=False, highlight=False)
+        say(f"\n[red bold]FAILED[/] {spec.run_id}: {store.path(spec, 'log.txt')} ends")
+        say(store.log_tail(spec), markup=False)
     if outcome.failed:
         raise SystemExit(1)
 
@@ -123,11 +124,11 @@ def make_report(plan: Suite, store: Store) -> None:
     cells = table1.make_cells(plan, store)
     console.print(table1.to_rich(plan, cells))
     for note in table1.notes(plan, cells):
-        console.print(f"• {note}", highlight=False, markup=False)
+        say(f"• {note}", markup=False)
     (folder / "table1.md").write_text(table1.to_markdown(plan, cells))
     table1.to_frame(cells).to_csv(folder / "table1.csv", index=False)
     figures.learning_curves(plan, store, folder / "learning_curves.png")
-    console.print(f"Written: {folder}/table1.md, table1.csv, learning_curves.png", highlight=False)
+    say(f"Written: {folder}/table1.md, table1.csv, learning_curves.png")
 
 
 def show_others(plan: Suite, store: Store) -> None:
@@ -147,11 +148,8 @@ def show_others(plan: Suite, store: Store) -> None:
         ]
         time = duration(sum(seconds) / (os.cpu_count() or 1))
         known = sum(seconds) == sum(seconds)  # NaN where an environment's speed is not known
-        console.print(
-            f"run-all --suite {name}: {len(other.runs)} runs, {other.timesteps:,} steps"
-            + (f", about {sum(seconds) / 3600:,.0f} core-hours, {time} here" if known else ""),
-            highlight=False,
-        )
+        cost = f", about {sum(seconds) / 3600:,.0f} core-hours, {time} here" if known else ""
+        say(f"run-all --suite {name}: {len(other.runs)} runs, {other.timesteps:,} steps{cost}")
 
 
 def main() -> None:

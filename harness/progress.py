@@ -55,7 +55,8 @@ class Progress:
         self.ended_runs += 1
         self.steps[spec.run_id] = self.store.steps(spec)
         number = f"[{self.ended_runs}/{len(self.specs)}]"
-        self.bar.console.print(f"{number} {spec.run_id}  {how}", highlight=False, markup=False)
+        line = f"{number} {spec.run_id}  {how}"
+        self.bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
 
     def update(self, running: list[RunSpec]) -> None:
         """Show how far all is, at most every half second, or every half minute in plain lines."""
@@ -72,7 +73,7 @@ class Progress:
         self.bar.update(self.task, completed=done, description=what, speed=speed)
         if not self.console.is_terminal:
             percent = f"{100 * done / self.total:.0f}%"
-            self.console.print(f"{what}  {percent}  {speed}", highlight=False)
+            self.console.print(f"{what}  {percent}  {speed}", highlight=False, soft_wrap=True)
 
 
 def duration(seconds: float) -> str:

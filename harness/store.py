@@ -85,6 +85,7 @@ class Store:
 
     def start(self, spec: RunSpec, command: list[str]) -> None:
         """Say what is about to run, before it does."""
+        self.path(spec).mkdir(parents=True, exist_ok=True)
         self.path(spec, "failed.json").unlink(missing_ok=True)
         content = {"hash": spec.hash, "baseline": spec.baseline, "args": spec.args}
         write_json(self.path(spec, "spec.json"), content | {"command": command})

@@ -17,7 +17,8 @@ from typing import Any
 import gymnasium as gym
 
 SUITES = Path(__file__).parent / "suites"
-KEYS = {"title", "note", "reports", "seeds", "agents", "args", "algorithms", "environments"}
+REQUIRED = {"title", "reports", "seeds", "agents", "args", "algorithms", "environments"}
+KEYS = REQUIRED | {"note"}
 
 
 class SuiteError(ValueError):
@@ -112,6 +113,8 @@ def load_suite(
     except tomllib.TOMLDecodeError as error:
         raise SuiteError(f"{path} is not valid TOML: {error}") from error
     _known(data, KEYS, f"{path.name}: key")
+    for key in sorted(REQUIRED - set(data)):
+        raise SuiteError(f"{path.name} needs the key {key!r}")
     _known(dict.fromkeys(env), set(data["environments"]), "environment")
     environments = {k: v for k, v in data["environments"].items() if k in env or not env}
     common = data["args"] | ({"total_timesteps": total_timesteps} if total_timesteps else {})
@@ -132,6 +135,8 @@ def load_suite(
                 for seed in data["seeds"][:seeds]
                 for agent in range(agents or data["agents"])
             ]
+    if not runs:
+        raise SuiteError(f"{path.name} has no runs: it needs algorithms, environments and seeds")
     return Suite(
         name=path.stem,
         title=data["title"],

@@ -37,7 +37,10 @@ def learning_curves(suite: Suite, store: Store, path: Path) -> None:
             axis.set_visible(True)
             for algorithm, color in zip(suite.algorithms, COLORS, strict=False):
                 _draw(
-                    axis, _curves(suite, store, environment, algorithm, measure), algorithm, color
+                    axis,
+                    agent_curves(suite, store, environment, algorithm, measure),
+                    algorithm,
+                    color,
                 )
             axis.spines[["top", "right"]].set_visible(False)
             axis.grid(alpha=0.25)
@@ -54,7 +57,7 @@ def learning_curves(suite: Suite, store: Store, path: Path) -> None:
     plt.close(figure)
 
 
-def _curves(
+def agent_curves(
     suite: Suite, store: Store, environment: str, algorithm: str, measure: str
 ) -> pd.DataFrame:
     """A row for each step count, a column for each agent."""

@@ -164,6 +164,13 @@ def test_flatten_refuses(delta, error, message):
         read(torch.ones(4, 3)).flatten(delta)
 
 
+@pytest.mark.parametrize("delta", [{"a": torch.ones(4, 3)}, torch.ones(4, 3)])
+def test_flatten_refuses_another_structure(delta):
+    states = read({"a": torch.ones(4, 3), "b": torch.ones(4, 3)})
+    with pytest.raises(ValueError, match="delta must match"):
+        states.flatten(delta)
+
+
 def test_flatten_refuses_a_delta_on_a_leaf_that_passes():
     obs = mixed_obs()
     delta = {name: x.float() for name, x in obs.items() if isinstance(x, Tensor)}

@@ -140,9 +140,15 @@ def test_integer_noise_is_refused(name):
         MAPS[name](np.array([[3, 4]]))
 
 
+@every_map
+def test_noise_must_be_an_array(name):
+    with pytest.raises(TypeError, match=r"noise must be an? .*array.*, got list"):
+        MAPS[name]([0.1, 0.2])
+
+
 def test_uniform_refuses_other_libraries():
-    with pytest.raises(TypeError, match="a NumPy array or a PyTorch tensor, got list"):
-        uniform([0.1, 0.2])
+    with pytest.raises(TypeError, match="a NumPy array or a PyTorch tensor, got ArrayImpl"):
+        uniform(jnp.ones(3))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,50 @@
+# Every target sets up what it needs in .venv, once. Python 3.11 with pip is all it asks for.
+
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+BIN := .venv/bin
+INSTALLED := .venv/installed
+
+.PHONY: help run test slow check bench lock clean
+
+help:  ## what each target does
+	@sed -n 's/^\([a-z]*\):.*##/\1\t/p' Makefile | expand -t 10
+
+run: $(INSTALLED)  ## the main job: PPO with and without the regularizer on 8 tasks, then a table
+	$(BIN)/python -m harness run-all --suite smoke
+	@echo "Look at results/smoke/report/learning_curves.png and results/smoke/report/table1.md"
+
+test: $(INSTALLED)  ## the default tests, in minutes
+	$(BIN)/python -m pytest --cov=condwrap --cov-fail-under=100
+
+slow: $(INSTALLED)  ## the tests that take minutes each or need a C++ compiler
+	$(BIN)/python -m pytest -m slow
+
+check: $(INSTALLED)  ## lint, format, types and the direction of imports
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(INSTALLED)  ## benchmarks, ratios within one run
+	$(BIN)/python -m pytest tests/benchmarks --benchmark-enable --benchmark-only \
+		--benchmark-group-by=group --benchmark-columns=median,iqr,rounds --benchmark-sort=name
+
+$(INSTALLED): requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "condwrap needs Python 3.11 or newer: make PYTHON=/path/to/python3.11"; exit 1; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --requirement requirements.lock
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	@touch $@
+
+lock:  ## write requirements.lock anew, from the newest versions that fit
+	rm -rf .venv-lock && $(PYTHON) -m venv .venv-lock
+	.venv-lock/bin/pip install --quiet torch==2.13.0 hatchling editables
+	.venv-lock/bin/pip install --quiet '.[harness,bullet,video,dev]'
+	echo '# Exact versions for Python 3.11 of all extras but wandb, written by `make lock`.' > requirements.lock
+	.venv-lock/bin/pip freeze --all | grep -v '^pip==\|^condwrap' | sed 's/+cpu//' >> requirements.lock
+	rm -rf .venv-lock
+
+clean:  ## remove the environment and caches; results/ and runs/ stay
+	rm -rf .venv .venv-lock .coverage .hypothesis .*_cache dist
+	find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +

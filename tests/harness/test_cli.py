@@ -1,0 +1,124 @@
+"""The commands, as a user types them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from harness import cli
+from harness.launchers.local import ROOT
+from harness.suite import suite_names
+from tests.harness.conftest import write_run
+
+
+@pytest.fixture
+def run_cli(monkeypatch, capsys):
+    """Run a command in this process; gives its exit status and output."""
+
+    def run(*words: object) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["harness", *map(str, words)])
+        monkeypatch.setattr(cli.console, "width", 200)
+        status = 0
+        try:
+            cli.main()
+        except SystemExit as stopped:
+            status = stopped.code if isinstance(stopped.code, int) else 1
+            message = "" if isinstance(stopped.code, int) else str(stopped.code)
+        else:
+            message = ""
+        captured = capsys.readouterr()
+        return status, captured.out + captured.err + message
+
+    return run
+
+
+@pytest.fixture
+def small(suite_file, store):
+    """Flags of the smallest plan: two runs."""
+    return ["--suite", suite_file, "--results-dir", store.root, "--seeds", 1, "--agents", 1,
+            "--env", "Hopper"]  # fmt: skip
+
+
+def test_run_all_runs_reports_and_runs_nothing_twice(run_cli, store, small):
+    status, out = run_cli("run-all", *small)
+    assert status == 0, out
+    assert "2 runs, 400 steps; 0 done before, 2 to do" in out
+    assert "106.8" in out
+    report = store.root / "tiny" / "report"
+    assert {p.name for p in report.iterdir()} == {"table1.md", "table1.csv", "learning_curves.png"}
+    status, out = run_cli("run-all", *small)
+    assert status == 0
+    assert "2 done before, 0 to do" in out
+    assert "done in" not in out
+
+
+def test_run_all_ends_with_the_log_of_what_failed(run_cli, store, suite, small):
+    broken = suite.runs[0]
+    store.start(broken, ["true"])
+    store.path(broken, "checkpoint.pt").write_bytes(b"torn")
+    status, out = run_cli("run-all", *small)
+    assert status == 1
+    assert "1 done before" not in out
+    assert "FAILED ppo__Hopper__s1__a0" in out
+    assert "no readable checkpoint" in out
+
+
+def test_run_all_says_what_the_other_suites_would_take(run_cli, store, small):
+    _, out = run_cli("run-all", *small)
+    assert "run-all --suite table1: 480 runs, 2,400,000,000 steps" in out
+
+
+def test_a_changed_configuration_is_refused_before_anything_starts(run_cli, store, suite, small):
+    write_run(store, suite.runs[0], [1.0])
+    status, out = run_cli("run-all", *small, "--total-timesteps", 300)
+    assert status == 1
+    assert "total_timesteps 200 -> 300" in out
+    assert not store.path(suite.runs[1]).exists()
+
+
+def test_status_counts_states(run_cli, store, suite, suite_file):
+    write_run(store, suite.runs[0], [1.0, 2.0])
+    store.start(suite.runs[1], ["true"])
+    status, out = run_cli("status", "--suite", suite_file, "--results-dir", store.root)
+    row = next(line for line in out.splitlines() if "tiny" in line)
+    assert status == 0
+    assert [int(x) for x in row.replace("│", " ").split()[1:6]] == [1, 0, 0, 1, 14]
+    assert "200 of 3,200" in row
+
+
+def test_list_names_every_suite(run_cli):
+    _, out = run_cli("list")
+    assert all(name in out for name in suite_names())
+
+
+def test_report_of_an_unfinished_suite(run_cli, store, suite, suite_file):
+    write_run(store, suite.runs[0], [1.0, 2.0])
+    status, out = run_cli("report", suite_file, "--results-dir", store.root)
+    assert status == 0
+    assert "1.5" in out
+    assert "Missing" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["run-all", "--suite", "tabel1"], "no suite 'tabel1'"),
+        (["run-all", "--env", "Hoper"], "Hopper?"),
+        (["run-all", "--jobs", "0"], "jobs must be at least 1, got 0"),
+        (["run-all", "--total-timesteps", "5"], "total_timesteps must be at least"),
+    ],
+)
+def test_bad_flags_are_refused(run_cli, words, message):
+    status, out = run_cli(*words)
+    assert status == 1
+    assert message in out
+
+
+def test_help_explains_every_flag():
+    words = [sys.executable, "-m", "harness", "run-all", "--help"]
+    out = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for flag in ("--suite", "--jobs", "--results-dir", "--total-timesteps", "--seeds", "--env"):
+        assert flag in out
+    assert "Ctrl-C" in out

@@ -1,0 +1,100 @@
+"""The store: states, completion, locks and torn files."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+
+import pytest
+
+from harness.store import StoreError, write_json
+from tests.harness.conftest import write_run
+
+
+def test_a_run_goes_from_pending_to_done(store, suite):
+    spec = suite.runs[0]
+    assert store.state(spec) == "pending"
+    store.start(spec, ["true"])
+    assert store.state(spec) == "interrupted"
+    write_run(store, spec, [1.0])
+    assert store.state(spec) == "done"
+
+
+def test_a_failed_run_says_so_until_it_is_started_again(store, suite):
+    spec = suite.runs[0]
+    store.start(spec, ["false"])
+    store.finish(spec, returncode=1, seconds=1.0)
+    assert store.state(spec) == "failed"
+    store.start(spec, ["true"])
+    assert store.state(spec) == "interrupted"
+
+
+def test_a_locked_run_is_running(store, suite):
+    spec = suite.runs[0]
+    store.start(spec, ["true"])
+    with store.lock(spec) as lock:
+        assert lock is not None
+        assert store.state(spec) == "running"
+        with store.lock(spec) as second:
+            assert second is None
+    assert store.state(spec) == "interrupted"
+
+
+def test_another_configuration_is_not_taken_for_a_finished_run(store, suite):
+    spec = suite.runs[0]
+    write_run(store, spec, [1.0])
+    changed = dataclasses.replace(spec, args={**spec.args, "gamma": 0.9})
+    with pytest.raises(StoreError, match=r"gamma None -> 0\.9.*--results-dir"):
+        store.state(changed)
+
+
+def test_checksums_are_of_the_files(store, suite):
+    spec = suite.runs[0]
+    write_run(store, spec, [1.0])
+    done = json.loads(store.path(spec, "done.json").read_text())
+    content = store.path(spec, "metrics.csv").read_bytes()
+    assert done["sha256"]["metrics.csv"] == hashlib.sha256(content).hexdigest()
+
+
+def test_metrics_leave_out_a_line_that_is_being_written(store, suite):
+    spec = suite.runs[0]
+    write_run(store, spec, [1.0, 2.0])
+    with open(store.path(spec, "metrics.csv"), "a") as file:
+        file.write("300,7")
+    assert store.metrics(spec)["charts/episodic_return"].tolist() == [1.0, 2.0]
+    assert store.steps(spec) == 200
+
+
+def test_a_run_without_rows_has_no_metrics(store, suite):
+    spec = suite.runs[0]
+    assert store.metrics(spec) is None
+    assert store.steps(spec) == 0
+    store.start(spec, ["true"])
+    store.path(spec, "metrics.csv").write_text("global_step,charts/SPS\n")
+    assert store.metrics(spec) is None
+    assert store.steps(spec) == 0
+
+
+def test_a_torn_file_is_named(store, suite):
+    spec = suite.runs[0]
+    write_run(store, spec, [1.0])
+    store.path(spec, "spec.json").write_text('{"hash": ')
+    with pytest.raises(StoreError, match=r"spec\.json is torn.*remove"):
+        store.state(spec)
+
+
+def test_json_is_written_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "done.json"
+    write_json(path, {"a": 1})
+    with pytest.raises(TypeError):
+        write_json(path, {"a": object()})
+    assert json.loads(path.read_text()) == {"a": 1}
+
+
+def test_the_end_of_the_log(store, suite):
+    spec = suite.runs[0]
+    assert store.log_tail(spec) == "(no log)"
+    store.start(spec, ["true"])
+    store.path(spec, "log.txt").write_text("\n".join(map(str, range(30))))
+    assert store.log_tail(spec, lines=2) == "28\n29"
