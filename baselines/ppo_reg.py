@@ -1,14 +1,13 @@
 """PPO with the conditioning penalty of Asadulaev et al. (arXiv 1906.05437), for continuous actions.
 
-    pip install "condwrap[baselines,bullet]"
     python ppo_reg.py --env-id HopperBulletEnv-v0 --seed 1         # PPO reg, the paper's settings
     python ppo_reg.py --env-id HopperBulletEnv-v0 --coefficient 0  # PPO
 
-This file needs nothing but an installed condwrap: copy it and change it. The lines that say
-`# condwrap` are all that the regularizer adds. Without them the file is PPO (Schulman et al., 2017,
-arXiv 1707.06347), and computes bit for bit what `--coefficient 0` does. A run's directory holds
-metrics.csv (a row for each update), TensorBoard events and checkpoint.pt; `--resume` continues a
-run as if it had never stopped.
+This file needs condwrap installed, with its extras `baselines` and `bullet`, and nothing else:
+copy it and change it. The lines that say `# condwrap` are all that the regularizer adds. Without
+them the file is PPO (Schulman et al., 2017, arXiv 1707.06347), and computes bit for bit what
+`--coefficient 0` does. A run's directory holds metrics.csv (a row for each update), TensorBoard
+events and checkpoint.pt; `--resume` continues a run as if it had never stopped.
 """
 
 from __future__ import annotations
