@@ -4,7 +4,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 INSTALLED := .venv/installed
 
-.PHONY: help run test slow check bench lock clean
+.PHONY: help run test tests slow check bench lock clean
 
 help:  ## what each target does
 	@sed -n 's/^\([a-z]*\):.*##/\1\t/p' Makefile | expand -t 10
@@ -14,7 +14,9 @@ run: $(INSTALLED)  ## the main job: PPO with and without the regularizer on 8 ta
 	@echo "Look at results/smoke/report/learning_curves.png and results/smoke/report/table1.md"
 
 test: $(INSTALLED)  ## the default tests, in minutes
-	$(BIN)/python -m pytest --cov=condwrap --cov-fail-under=100
+	$(BIN)/python -m pytest --numprocesses=auto --cov=condwrap --cov-fail-under=100
+
+tests: test
 
 slow: $(INSTALLED)  ## the tests that take minutes each or need a C++ compiler
 	$(BIN)/python -m pytest -m slow

@@ -1,13 +1,13 @@
-"""PPO with the conditioning penalty of Asadulaev et al. (arXiv 1906.05437), for continuous actions.
+"""PPO (Schulman et al., 2017, arXiv 1707.06347) for continuous actions, to copy and change.
 
-    python ppo_reg.py --env-id HopperBulletEnv-v0 --seed 1         # PPO reg, the paper's settings
-    python ppo_reg.py --env-id HopperBulletEnv-v0 --coefficient 0  # PPO
+    python ppo_reg.py --env-id HopperBulletEnv-v0 --seed 1
 
-This file needs condwrap installed, with its extras `baselines` and `bullet`, and nothing else:
-copy it and change it. The lines that say `# condwrap` are all that the regularizer adds. Without
-them the file is PPO (Schulman et al., 2017, arXiv 1707.06347), and computes bit for bit what
-`--coefficient 0` does. A run's directory holds metrics.csv (a row for each update), TensorBoard
-events and checkpoint.pt; `--resume` continues a run as if it had never stopped.
+Lines marked so are the conditioning penalty (Asadulaev et al., arXiv 1906.05437):  # condwrap
+`--coefficient 0` computes bit for bit what the file computes without them.  # condwrap
+They need condwrap installed, with its extras `baselines` and `bullet`.  # condwrap
+
+A run's directory holds metrics.csv (a row for each update), TensorBoard events and checkpoint.pt;
+`--resume` continues a run as if it had never stopped.
 """
 
 from __future__ import annotations
@@ -36,7 +36,12 @@ from torch.distributions import Independent, Normal
 from torch.utils.tensorboard import SummaryWriter
 
 from condwrap import ConditioningRegularizer  # condwrap
+from condwrap.spectrum import jacobian_singular_values  # condwrap
 from condwrap.wrappers import VectorPerturbObservation  # condwrap
+
+
+class RunError(Exception):
+    """A run that cannot start, and what to do."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,9 +101,11 @@ class Args:
     radius: float = 1.0  # condwrap
     """size of delta, in the normalized observations' units"""  # condwrap
     perturb_obs: bool = False  # condwrap
-    """train on perturbed observations: noise augmentation, the penalty's rival"""  # condwrap
+    """train on perturbed observations; with --coefficient 0, the penalty's rival"""  # condwrap
+    log_spectrum: int = 0  # condwrap
+    """updates between two logs of the Jacobian's singular values; 0: never"""  # condwrap
     run_dir: Path | None = None
-    """where the run's files go; by default runs/<environment>__ppo_reg__s<seed>__a<agent>"""
+    """where the run's files go; by default runs/<environment>__<this file>__s<seed>__a<agent>"""
     resume: bool = False
     """continue from the run directory's checkpoint, if it has one"""
     checkpoint_interval: int = 50
@@ -109,22 +116,27 @@ class Args:
     """log to Weights & Biases too (needs wandb; WANDB_PROJECT names the project)"""
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if name in POSITIVE and not value > 0:
-                raise ValueError(f"{name} must be above 0, got {value}")
-            if name in ("gamma", "gae_lambda") and not 0 <= value <= 1:
-                raise ValueError(f"{name} must be in [0, 1], got {value}")
+        for name, least in AT_LEAST.items():
+            values = getattr(self, name) if name == "hidden_sizes" else [getattr(self, name)]
+            if not all(value >= least for value in values):
+                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        for name in ("learning_rate", "vf_learning_rate", "clip_coef", "max_grad_norm"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be finite and above 0, got {getattr(self, name)}")
+        for name in ("gamma", "gae_lambda"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")
+        batch = f"num_envs * num_steps = {self.batch_size}"
         if self.batch_size % self.num_minibatches or self.batch_size == self.num_minibatches:
             raise ValueError(
-                f"num_minibatches must divide num_envs * num_steps = {self.batch_size} into parts "
-                f"of 2 or more, got {self.num_minibatches}"
+                f"num_minibatches must divide {batch} into parts of 2 or more, "
+                f"got {self.num_minibatches}"
             )
         if self.total_timesteps < self.batch_size:
             raise ValueError(
-                f"total_timesteps must be at least num_envs * num_steps = {self.batch_size}, "
-                f"got {self.total_timesteps}"
+                f"total_timesteps must be at least {batch}, got {self.total_timesteps}"
             )
-        ConditioningRegularizer(**self.conditioning)  # condwrap: its own checks
+        self.regularizer(self.coefficient, seed=0)  # condwrap: its own checks
 
     @property
     def batch_size(self) -> int:
@@ -134,19 +146,21 @@ class Args:
     def num_updates(self) -> int:
         return self.total_timesteps // self.batch_size
 
-    @property  # condwrap
-    def conditioning(self) -> dict[str, Any]:  # condwrap
-        names = ("coefficient", "lambda_min", "lambda_max", "perturbation", "radius")  # condwrap
-        return {name: getattr(self, name) for name in names}  # condwrap
+    def regularizer(self, coefficient: float, seed: int) -> ConditioningRegularizer:  # condwrap
+        sizes = {"perturbation": self.perturbation, "radius": self.radius}  # condwrap
+        lambdas = (self.lambda_min, self.lambda_max)  # condwrap
+        return ConditioningRegularizer(coefficient, *lambdas, **sizes, seed=seed)  # condwrap
 
     @property
     def path(self) -> Path:
-        name = f"{self.env_id.split(':')[-1]}__ppo_reg__s{self.seed}__a{self.agent}"
+        name = f"{self.env_id.split(':')[-1]}__{Path(__file__).stem}__s{self.seed}__a{self.agent}"
         return self.run_dir or Path("runs", name)
 
 
-POSITIVE = {"num_envs", "num_steps", "num_minibatches", "update_epochs", "learning_rate"}
-POSITIVE |= {"vf_epochs", "vf_learning_rate", "clip_coef", "max_grad_norm", "checkpoint_interval"}
+AT_LEAST = {"seed": 0, "agent": 0, "num_envs": 1, "num_steps": 1, "num_minibatches": 1}
+AT_LEAST |= {"update_epochs": 1, "vf_epochs": 1, "checkpoint_interval": 1, "hidden_sizes": 1}
+AT_LEAST |= {"log_spectrum": 0}  # condwrap
+CLIP = 10.0  # of normalized observations
 MAY_CHANGE = {"run_dir", "resume", "capture_video", "track"}  # when a run is resumed
 
 
@@ -154,23 +168,20 @@ MAY_CHANGE = {"run_dir", "resume", "capture_video", "track"}  # when a run is re
 
 
 class NormalizeObservation(VectorWrapper):
-    """(obs - mean) / std by running statistics, clipped; maps `final_obs` too.
+    """(obs - mean) / std by running statistics, clipped; `final_obs` too, unlike Gymnasium's own.
 
-    Gymnasium's own refuses SAME_STEP autoreset. The statistics belong to the caller: they outlive
-    the environments, go into checkpoints, and stay as they are with `update=False`.
+    The statistics are the caller's: they outlive the environments, and `update=False` freezes them.
     """
 
-    def __init__(
-        self, env: VectorEnv, rms: RunningMeanStd, clip: float = 10.0, update: bool = True
-    ) -> None:
+    def __init__(self, env: VectorEnv, rms: RunningMeanStd, update: bool = True) -> None:
         super().__init__(env)
-        self.rms, self.clip, self.update = rms, clip, update
-        box = gym.spaces.Box(-clip, clip, env.single_observation_space.shape, np.float32)
+        self.rms, self.update = rms, update
+        box = gym.spaces.Box(-CLIP, CLIP, env.single_observation_space.shape, np.float32)
         self.single_observation_space = box
         self.observation_space = gym.vector.utils.batch_space(box, env.num_envs)
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[np.ndarray, dict]:
-        obs, info = self.env.reset(seed=seed, options=options)
+    def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict]:
+        obs, info = self.env.reset(**kwargs)
         return self.observe(obs), info
 
     def step(self, actions: np.ndarray) -> tuple:
@@ -186,7 +197,7 @@ class NormalizeObservation(VectorWrapper):
 
     def normalize(self, obs: np.ndarray) -> np.ndarray:
         scaled = (obs - self.rms.mean) / np.sqrt(self.rms.var + 1e-8)
-        return np.clip(scaled, -self.clip, self.clip).astype(np.float32)
+        return np.clip(scaled, -CLIP, CLIP).astype(np.float32)
 
 
 def make_env(args: Args, index: int, checkpoint: int) -> gym.Env:
@@ -195,7 +206,7 @@ def make_env(args: Args, index: int, checkpoint: int) -> gym.Env:
     video = args.capture_video and index == 0
     env = gym.make(env_id, **({"render_mode": "rgb_array"} if video else {}))
     if not isinstance(env.action_space, gym.spaces.Box):
-        raise ValueError(f"env_id must name a task with a Box of actions, got {env.action_space}")
+        raise RunError(f"env_id must name a task with a Box of actions, got {env.action_space}")
     if video:
         folder, prefix = str(args.path / "videos"), f"checkpoint-{checkpoint}"
         env = gym.wrappers.RecordVideo(env, folder, name_prefix=prefix)
@@ -280,31 +291,26 @@ def rollout(args: Args, learner: Learner, envs: VectorEnv, next_obs: np.ndarray)
     """Step the environments; autoreset is in the same step, so every transition counts."""
     actor, critic, space = learner.actor, learner.critic, envs.single_action_space
     shape = (args.num_steps, envs.num_envs)
-    obs = np.empty((*shape, next_obs.shape[-1]), np.float32)
-    rewards, dones = np.empty(shape, np.float32), np.empty(shape, np.float32)
-    noise = torch.randn((*shape, *space.shape), generator=learner.generators["action"])
+    obs, after = (np.empty((*shape, next_obs.shape[-1]), np.float32) for _ in range(2))
+    rewards, ends, dones = (np.empty(shape, np.float32) for _ in range(3))
+    noise = torch.randn((*shape, len(actor.log_std)), generator=learner.generators["action"])
     actions = noise * actor.log_std.exp()
-    final_obs: dict[tuple[int, int], np.ndarray] = {}  # what truncated episodes showed last
     returns: list[float] = []
     lengths: list[int] = []
     for t in range(args.num_steps):
         obs[t] = next_obs
         actions[t] += actor.mean(torch.from_numpy(obs[t]))
-        clipped = np.clip(actions[t].numpy(), space.low, space.high)
-        next_obs, rewards[t], terminated, truncated, info = envs.step(clipped)
-        dones[t] = terminated | truncated
+        action = actions[t].numpy().reshape(-1, *space.shape)
+        next_obs, rewards[t], ends[t], cut, info = envs.step(np.clip(action, space.low, space.high))
+        after[t], dones[t] = next_obs, np.maximum(ends[t], cut)
+        for i in np.flatnonzero(dones[t]):
+            after[t, i] = info["final_obs"][i]
         if "episode" in info:
             returns += info["episode"]["r"][info["_episode"]].tolist()
             lengths += info["episode"]["l"][info["_episode"]].tolist()
-        for i in np.flatnonzero(truncated & ~terminated):  # termination wins
-            final_obs[t, i] = info["final_obs"][i]
-    states = torch.from_numpy(np.concatenate([obs, next_obs[None]], dtype=np.float32))
-    values = critic(states).squeeze(-1)  # [T + 1, N]
-    next_values = values[1:] * (1 - torch.from_numpy(dones))
-    for (t, i), last in final_obs.items():
-        next_values[t, i] = critic(torch.from_numpy(np.asarray(last, np.float32)))
-    return Rollout(states[:-1], actions, torch.from_numpy(rewards), torch.from_numpy(dones),
-                   values[:-1], next_values, next_obs, returns, lengths)  # fmt: skip
+    obs, after, rewards, ends, dones = map(torch.from_numpy, (obs, after, rewards, ends, dones))
+    values, next_values = critic(obs).squeeze(-1), critic(after).squeeze(-1) * (1 - ends)
+    return Rollout(obs, actions, rewards, dones, values, next_values, next_obs, returns, lengths)
 
 
 def gae(data: Rollout, gamma: float, gae_lambda: float) -> Tensor:
@@ -345,6 +351,10 @@ def update(args: Args, learner: Learner, data: Rollout) -> dict[str, float]:
     policy's terms and the critic's each by an optimizer of their own, since they share no weights.
     """
     actor, critic = learner.actor, learner.critic
+    if args.anneal_lr:
+        left = 1 - learner.update / args.num_updates
+        learner.actor_optimizer.param_groups[0]["lr"] = left * args.learning_rate
+        learner.critic_optimizer.param_groups[0]["lr"] = left * args.vf_learning_rate
     obs, actions = data.obs.flatten(0, 1), data.actions.flatten(0, 1)
     advantages = gae(data, args.gamma, args.gae_lambda).flatten()
     values = data.values.flatten()
@@ -376,37 +386,56 @@ def update(args: Args, learner: Learner, data: Rollout) -> dict[str, float]:
     names = ("policy_loss", "entropy", "approx_kl", "clipfrac", "value_loss", "explained_variance")
     explained = 1 - (targets - values).var() / targets.var()
     logs = [*torch.stack(policy_logs).mean(0), torch.stack(value_losses).mean(), explained]
-    return {f"losses/{name}": x.item() for name, x in zip(names, logs, strict=True)}
+    losses = {f"losses/{name}": x.item() for name, x in zip(names, logs, strict=True)}
+    return {"charts/learning_rate": learner.actor_optimizer.param_groups[0]["lr"], **losses}
 
 
-def measure_conditioning(learner: Learner, obs: Tensor) -> dict[str, float]:  # condwrap
+def measure_conditioning(args: Args, learner: Learner, obs: Tensor) -> dict[str, float]:  # condwrap
     """How the new policy is conditioned on the whole rollout: one rule in every run."""  # condwrap
-    measured = learner.probe(learner.actor, obs.flatten(0, 1))  # condwrap
-    quantiles = measured.quotient.quantile(torch.tensor([0.05, 0.5, 0.95]))  # condwrap
-    names = ("quotient_q05", "quotient_q50", "quotient_q95")  # condwrap
-    logs = dict(zip(names, quantiles, strict=True))  # condwrap
-    logs["psi"] = measured.psi.mean()  # condwrap
-    logs["fraction_below"] = measured.fraction_below  # condwrap
+    obs = obs.flatten(0, 1)  # condwrap
+    measured = learner.probe(learner.actor, obs)  # condwrap
+    q05, q50, q95 = measured.quotient.quantile(torch.tensor([0.05, 0.5, 0.95]))  # condwrap
+    logs = {"psi": measured.psi.mean(), "quotient_q05": q05, "quotient_q50": q50}  # condwrap
+    logs |= {"quotient_q95": q95, "fraction_below": measured.fraction_below}  # condwrap
     logs["fraction_above"] = measured.fraction_above  # condwrap
+    if args.log_spectrum:  # condwrap
+        values = torch.full((1, 1), math.nan)  # condwrap
+        if learner.update % args.log_spectrum == 0:  # condwrap
+            with torch.no_grad():  # condwrap
+                values = jacobian_singular_values(learner.actor, obs)  # condwrap
+        logs["singular_value_max"] = values[:, 0].mean()  # condwrap
+        logs["singular_value_mean"] = values.mean()  # condwrap
+        logs["squared_singular_value"] = values.square().mean()  # condwrap
+        logs["condition_number"] = (values[:, 0] / values[:, -1]).median()  # condwrap
     return {f"conditioning/{name}": x.item() for name, x in logs.items()}  # condwrap
 
 
 # --- state and files ------------------------------------------------------------------------------
 
 
-@dataclasses.dataclass
 class Learner:
     """All that changes while training, and so all that a checkpoint holds."""
 
-    actor: Actor
-    critic: nn.Module
-    actor_optimizer: torch.optim.Optimizer
-    critic_optimizer: torch.optim.Optimizer
-    generators: dict[str, torch.Generator]
-    stats: dict[str, RunningMeanStd]
-    regularizer: ConditioningRegularizer  # condwrap
-    probe: ConditioningRegularizer  # condwrap
-    update: int = 0
+    def __init__(self, args: Args) -> None:
+        self.stats: dict[str, RunningMeanStd] = {}
+        envs = make_envs(dataclasses.replace(args, capture_video=False), 0, self.stats)
+        obs_dim = math.prod(envs.single_observation_space.shape)
+        action_dim = math.prod(envs.single_action_space.shape)
+        envs.close()
+        names = ("init", "action", "minibatch", "penalty", "probe")  # each use has its own stream
+        streams = np.random.SeedSequence((args.seed, args.agent)).spawn(len(names))
+        seeds = {
+            n: int(s.generate_state(1, np.uint64)[0]) for n, s in zip(names, streams, strict=True)
+        }
+        self.generators = {n: torch.Generator().manual_seed(seeds[n]) for n in names[:3]}
+        self.actor = Actor((obs_dim, *args.hidden_sizes, action_dim), self.generators["init"])
+        self.critic = make_mlp((obs_dim, *args.hidden_sizes, 1), 1.0, self.generators["init"])
+        adam = functools.partial(torch.optim.Adam, eps=1e-5)
+        self.actor_optimizer = adam(self.actor.parameters(), args.learning_rate)
+        self.critic_optimizer = adam(self.critic.parameters(), args.vf_learning_rate)
+        self.regularizer = args.regularizer(args.coefficient, seeds["penalty"])  # condwrap
+        self.probe = args.regularizer(0.0, seeds["probe"])  # condwrap
+        self.update = 0
 
     def state_dict(self) -> dict[str, Any]:
         state: dict[str, Any] = {name: getattr(self, name).state_dict() for name in TRAINED}
@@ -428,32 +457,6 @@ class Learner:
 
 TRAINED = ("actor", "critic", "actor_optimizer", "critic_optimizer")
 TRAINED += ("regularizer", "probe")  # condwrap
-
-
-def make_learner(args: Args) -> Learner:
-    """Everything at its start, each use of randomness with a generator of its own."""
-    stats: dict[str, RunningMeanStd] = {}
-    envs = make_envs(dataclasses.replace(args, capture_video=False), 0, stats)
-    obs_dim = math.prod(envs.single_observation_space.shape)
-    action_dim = math.prod(envs.single_action_space.shape)
-    envs.close()
-    names = ("init", "action", "minibatch", "penalty", "probe")
-    streams = np.random.SeedSequence((args.seed, args.agent)).spawn(len(names))
-    seeds = {n: int(s.generate_state(1, np.uint64)[0]) for n, s in zip(names, streams, strict=True)}
-    rngs = {n: torch.Generator().manual_seed(seeds[n]) for n in ("init", "action", "minibatch")}
-    measuring = {**args.conditioning, "coefficient": 0.0}  # condwrap
-    actor = Actor((obs_dim, *args.hidden_sizes, action_dim), rngs["init"])
-    critic = make_mlp((obs_dim, *args.hidden_sizes, 1), 1.0, rngs["init"])
-    return Learner(
-        actor=actor,
-        critic=critic,
-        actor_optimizer=torch.optim.Adam(actor.parameters(), args.learning_rate, eps=1e-5),
-        critic_optimizer=torch.optim.Adam(critic.parameters(), args.vf_learning_rate, eps=1e-5),
-        generators=rngs,
-        stats=stats,
-        regularizer=ConditioningRegularizer(**args.conditioning, seed=seeds["penalty"]),  # condwrap
-        probe=ConditioningRegularizer(**measuring, seed=seeds["probe"]),  # condwrap
-    )
 
 
 def write_metrics(args: Args, writer: SummaryWriter, row: dict[str, float]) -> None:
@@ -488,8 +491,8 @@ def load_checkpoint(args: Args) -> dict[str, Any] | None:
     """The newest checkpoint that can be read, if the run may be resumed and there is one."""
     path = args.path / "checkpoint.pt"
     found = [p for p in (path, path.with_suffix(".previous.pt")) if p.exists()]
-    if found and not args.resume:
-        raise ValueError(f"{args.path} holds a run: --resume it, or name another --run-dir")
+    if not args.resume and (found or (args.path / "metrics.csv").exists()):
+        raise RunError(f"{args.path} holds a run: --resume it, or name another --run-dir")
     for candidate in found:
         try:
             saved = torch.load(candidate, weights_only=True)
@@ -497,11 +500,12 @@ def load_checkpoint(args: Args) -> dict[str, Any] | None:
             print(f"{candidate} cannot be read: {error!r}")
             continue
         for name, value in saved["args"].items():
-            if value != vars(args)[name]:
-                raise ValueError(f"{args.path} was run with {name}={value}, not {vars(args)[name]}")
+            now = getattr(args, name, None)
+            if value != now:
+                raise RunError(f"{args.path} was run with {name}={value}, not {now}")
         return saved
     if found:
-        raise ValueError(f"{args.path} holds no readable checkpoint: remove it to start anew")
+        raise RunError(f"{args.path} holds no readable checkpoint: remove it to start anew")
     return None
 
 
@@ -510,51 +514,45 @@ def load_checkpoint(args: Args) -> dict[str, Any] | None:
 
 def train(args: Args) -> Learner:
     """Train, or continue to train, until `total_timesteps`."""
-    args.path.mkdir(parents=True, exist_ok=True)
     saved = load_checkpoint(args)
-    learner = make_learner(args)
+    learner = Learner(args)
     if saved:
         learner.load_state_dict(saved["learner"])
+    if learner.update == args.num_updates:
+        print(f"{args.path} is finished")
+        return learner
+    args.path.mkdir(parents=True, exist_ok=True)
     first, started, printed = learner.update, time.time(), -math.inf
     with open(args.path / "metrics.csv", "a") as metrics:
-        metrics.truncate(saved["metrics_size"] if saved else 0)  # later rows are computed again
-    writer = SummaryWriter(str(args.path), purge_step=first * args.batch_size or None)
+        size = saved["metrics_size"] if saved else 0
+        if metrics.tell() < size:
+            raise RunError(f"{metrics.name} lacks rows: remove its folder to start anew")
+        metrics.truncate(size)  # later rows are computed again
+    writer = SummaryWriter(str(args.path), purge_step=first * args.batch_size + 1)
     rows = "".join(f"\n|{name}|{value}|" for name, value in vars(args).items())
     writer.add_text("hyperparameters", f"|parameter|value|\n|-|-|{rows}")
-    envs: VectorEnv | None = None
-    while learner.update < args.num_updates:
-        checkpoint, updates_since = divmod(learner.update, args.checkpoint_interval)
-        if envs is None or updates_since == 0:
-            if envs is not None:
-                envs.close()
-                save_checkpoint(args, learner)
-            envs = make_envs(args, checkpoint, learner.stats)
-            next_obs, _ = envs.reset(seed=env_seeds(args, checkpoint))
-        if args.anneal_lr:
-            left = 1 - learner.update / args.num_updates
-            learner.actor_optimizer.param_groups[0]["lr"] = left * args.learning_rate
-            learner.critic_optimizer.param_groups[0]["lr"] = left * args.vf_learning_rate
-        data = rollout(args, learner, envs, next_obs)
-        next_obs = data.next_obs
-        losses = update(args, learner, data)
-        learner.update += 1
-        speed = (learner.update - first) * args.batch_size / (time.time() - started)
-        row = {
-            "global_step": learner.update * args.batch_size,
-            "charts/episodic_return": float(np.mean(data.returns)) if data.returns else math.nan,
-            "charts/episodic_length": float(np.mean(data.lengths)) if data.lengths else math.nan,
-            "charts/SPS": speed,
-            **losses,
-            **measure_conditioning(learner, data.obs),  # condwrap
-        }
-        write_metrics(args, writer, row)
-        if time.time() - printed > 10 or learner.update == args.num_updates:
-            printed = time.time()
-            minutes = (args.num_updates - learner.update) * args.batch_size / speed / 60
-            print(f"update {learner.update}/{args.num_updates}", end="  ")
-            print(f"return {row['charts/episodic_return']:.1f}", end="  ")
-            print(f"{speed:.0f} steps/s  {minutes:.1f} min left")
-    if envs is not None:
+    while learner.update < args.num_updates:  # from one checkpoint to the next
+        checkpoint = learner.update // args.checkpoint_interval
+        envs = make_envs(args, checkpoint, learner.stats)
+        next_obs, _ = envs.reset(seed=env_seeds(args, checkpoint))
+        for _ in range(min(args.checkpoint_interval, args.num_updates - learner.update)):
+            data = rollout(args, learner, envs, next_obs)
+            next_obs, losses = data.next_obs, update(args, learner, data)
+            learner.update += 1
+            speed = (learner.update - first) * args.batch_size / (time.time() - started)
+            row = {
+                "global_step": learner.update * args.batch_size,
+                "charts/episodic_return": float(np.mean(data.returns or math.nan)),
+                "charts/episodic_length": float(np.mean(data.lengths or math.nan)),
+                "charts/SPS": speed,
+                **losses,
+                **measure_conditioning(args, learner, data.obs),  # condwrap
+            }
+            write_metrics(args, writer, row)
+            if time.time() - printed > 10 or learner.update == args.num_updates:
+                printed = time.time()
+                print(f"update {learner.update}/{args.num_updates}  {speed:.0f} steps/s  "
+                      f"return {row['charts/episodic_return']:.1f}")  # fmt: skip
         envs.close()
         save_checkpoint(args, learner)
     writer.close()
@@ -564,7 +562,8 @@ def train(args: Args) -> Learner:
 def main() -> None:
     torch.set_num_threads(1)  # more do not pay for networks of this size
     sys.stdout.reconfigure(line_buffering=True)  # progress shows in a log file too
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for stop in (signal.SIGTERM, signal.SIGINT):  # a background job may begin with SIGINT ignored
+        signal.signal(stop, signal.default_int_handler)
     try:
         args = tyro.cli(Args, description=__doc__)
         if args.track:
@@ -572,10 +571,10 @@ def main() -> None:
 
             wandb.init(name=args.path.name, config=vars(args), sync_tensorboard=True)
         train(args)
-    except ValueError as error:
+    except (RunError, gym.error.Error, ModuleNotFoundError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
-        sys.exit("interrupted: --resume continues from the last checkpoint")
+        sys.exit("interrupted: --resume continues from the last checkpoint, if there is one yet")
 
 
 if __name__ == "__main__":

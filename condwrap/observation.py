@@ -97,6 +97,11 @@ class States:
         index = torch.arange(count, device=self.device) * size // count
         return dataclasses.replace(self, leaves=[leaf[index] for leaf in self.leaves])
 
+    def chunks(self, size: int) -> list[States]:
+        """The same states, at most `size` at a time along the first axis."""
+        parts = zip(*(torch.split(leaf, size) for leaf in self.leaves), strict=True)
+        return [dataclasses.replace(self, leaves=list(leaves)) for leaves in parts]
+
     def obs(self, perturbed: Sequence[Tensor]) -> Any:
         """The observation, in its structure, with these perturbed leaves."""
         new = iter(perturbed)

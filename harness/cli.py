@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import functools
+import math
 import os
 import signal
 import sys
 from collections import Counter
 from pathlib import Path
-from typing import Annotated
 
 import tyro
 from rich.console import Console
@@ -17,8 +17,9 @@ from rich.table import Table
 from harness.launchers.local import Outcome, run_local
 from harness.progress import Progress, duration
 from harness.report import figures, table1
-from harness.store import Store, StoreError
-from harness.suite import Suite, SuiteError, load_suite, suite_names
+from harness.report.results import Results, load_results
+from harness.store import STATES, Store, StoreError
+from harness.suite import SuiteError, load_suite, suite_names
 
 app = tyro.extras.SubcommandApp()
 console = Console()
@@ -29,7 +30,7 @@ DEFAULT_SUITE = "smoke"
 @app.command(name="run-all")
 def run_all(
     suite: str = DEFAULT_SUITE,
-    jobs: int = os.cpu_count() or 1,
+    jobs: int | None = None,
     results_dir: Path = Path("results"),
     total_timesteps: int | None = None,
     seeds: int | None = None,
@@ -50,10 +51,13 @@ def run_all(
         agents: Only so many agents for each seed.
         env: Only these tasks, such as Hopper.
     """
+    jobs = cores() if jobs is None else jobs
     if jobs < 1:
         raise SuiteError(f"jobs must be at least 1, got {jobs}")
     store = Store(results_dir)
     plan = load_suite(suite, total_timesteps=total_timesteps, seeds=seeds, agents=agents, env=env)
+    for spec in plan.runs:
+        store.refuse_changed(spec)
     todo = [spec for spec in plan.runs if store.state(spec) != "done"]
     done = len(plan.runs) - len(todo)
     say(
@@ -64,8 +68,9 @@ def run_all(
     if todo:
         with Progress(console, store, todo) as progress:
             outcome = run_local(todo, store, jobs, progress)
-    make_report(plan, store)
-    show_others(plan, store)
+    whole = load_results(load_suite(suite, total_timesteps=total_timesteps), store)
+    make_report(whole, store)
+    show_others(whole)
     if outcome.held:
         say(f"[yellow]{len(outcome.held)} runs are being run by another process.[/]")
     for spec in outcome.failed:
@@ -89,76 +94,87 @@ def list_suites() -> None:
 def status(suite: tuple[str, ...] = (), results_dir: Path = Path("results")) -> None:
     """Tell how far each suite is: runs done, running, failed, interrupted and pending.
 
+    "changed" counts runs whose folder holds another configuration than the suite's.
+
     Args:
         suite: Names of suites; by default all.
         results_dir: Where the runs' folders are.
     """
     store = Store(results_dir)
-    table = Table("suite", "done", "running", "failed", "interrupted", "pending", "steps")
+    table = Table("suite", *STATES, "steps")
     for name in suite or suite_names():
         plan = load_suite(name)
-        states = Counter(store.state(spec) for spec in plan.runs)
-        steps = sum(store.steps(spec) for spec in plan.runs)
-        counts = [str(states[s]) for s in ("done", "running", "failed", "interrupted", "pending")]
-        table.add_row(name, *counts, f"{steps:,} of {plan.timesteps:,}")
+        states = {run.run_id: store.state(run) for run in plan.runs}
+        steps = sum(store.steps(run) for run in plan.runs if states[run.run_id] != "changed")
+        counts = Counter(states.values())
+        numbers = [str(counts[state]) for state in STATES]
+        table.add_row(plan.name, *numbers, f"{steps:,} of {plan.timesteps:,}")
     console.print(table)
 
 
 @app.command(name="report")
-def report(
-    suite: Annotated[str, tyro.conf.Positional] = DEFAULT_SUITE,
-    results_dir: Path = Path("results"),
-) -> None:
+def report(suite: str = DEFAULT_SUITE, results_dir: Path = Path("results")) -> None:
     """Report what a suite's runs show so far, beside the paper's tables.
 
     Args:
         suite: Name of a suite (see `list`), or path of a TOML file.
         results_dir: Where the runs' folders are and the report goes.
     """
-    make_report(load_suite(suite), Store(results_dir))
+    plan, store = load_suite(suite), Store(results_dir)
+    make_report(load_results(plan, store), store)
 
 
-def make_report(plan: Suite, store: Store) -> None:
+def make_report(results: Results, store: Store) -> None:
     """Print the table and write it, and the learning curves, to results/<suite>/report/."""
-    folder = store.report_path(plan.name)
-    cells = table1.make_cells(plan, store)
-    console.print(table1.to_rich(plan, cells))
-    for note in table1.notes(plan, cells):
+    folder = store.report_path(results.suite.name)
+    cells = table1.make_cells(results)
+    console.print(table1.to_rich(results, cells))
+    for note in table1.notes(results, cells):
         say(f"• {note}", markup=False)
-    (folder / "table1.md").write_text(table1.to_markdown(plan, cells))
+    (folder / "table1.md").write_text(table1.to_markdown(results, cells))
     table1.to_frame(cells).to_csv(folder / "table1.csv", index=False)
-    figures.learning_curves(plan, store, folder / "learning_curves.png")
+    algorithms = results.suite.algorithms
+    figures.learning_curves(results, algorithms, folder / "learning_curves.png")
     say(f"Written: {folder}/table1.md, table1.csv, learning_curves.png")
 
 
-def show_others(plan: Suite, store: Store) -> None:
+def show_others(results: Results) -> None:
     """What the other suites would take here, at the speed that this one's runs have shown."""
-    speed = {}
-    for spec in plan.runs:
-        metrics = store.metrics(spec)
-        if metrics is not None:
-            speed[spec.baseline, spec.environment] = metrics["charts/SPS"].iloc[-1]
+    speed = {
+        (run.baseline, run.environment): results.metrics[run.run_id]["charts/SPS"].iloc[-1]
+        for run in results.suite.runs
+        if run.run_id in results.metrics
+    }
     for name in suite_names():
-        if name == plan.name:
+        if name == results.suite.name:
             continue
         other = load_suite(name)
-        seconds = [
-            r.args["total_timesteps"] / speed.get((r.baseline, r.environment), float("nan"))
+        seconds = sum(
+            r.args["total_timesteps"] / speed.get((r.baseline, r.environment), math.nan)
             for r in other.runs
-        ]
-        time = duration(sum(seconds) / (os.cpu_count() or 1))
-        known = sum(seconds) == sum(seconds)  # NaN where an environment's speed is not known
-        cost = f", about {sum(seconds) / 3600:,.0f} core-hours, {time} here" if known else ""
-        say(f"run-all --suite {name}: {len(other.runs)} runs, {other.timesteps:,} steps{cost}")
+        )
+        cost = "" if math.isnan(seconds) else (
+            f", about {seconds / 3600:,.0f} core-hours, {duration(seconds / cores())} here"
+        )  # fmt: skip
+        what = f"{len(other.runs)} runs, {other.timesteps:,} steps"
+        say(f"To come: run-all --suite {name} takes {what}{cost}.")
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 def main() -> None:
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for stop in (signal.SIGTERM, signal.SIGINT):  # a background job may begin with SIGINT ignored
+        signal.signal(stop, signal.default_int_handler)
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # and nohup is left to work
+        signal.signal(signal.SIGHUP, signal.default_int_handler)
     try:
         app.cli(prog="python -m harness", description=__doc__)
     except (SuiteError, StoreError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
-        console.print("\nInterrupted. The runs are stopped and their checkpoints kept: "
-                      "the same command continues.")  # fmt: skip
+        say("\nInterrupted: the same command continues from the runs' last checkpoints.")
         sys.exit(130)

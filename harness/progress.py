@@ -34,7 +34,7 @@ class Progress:
             rich.progress.TextColumn("{task.fields[speed]}"),
             rich.progress.TimeElapsedColumn(),
             console=console,
-            disable=not console.is_terminal,
+            disable=not console.is_interactive,
         )
         self.task = self.bar.add_task("", total=self.total, completed=self.first, speed="")
 
@@ -48,32 +48,36 @@ class Progress:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        self._show()  # the last state, not the one of half a second ago
         self.bar.__exit__(kind, error, traceback)
 
     def ended(self, spec: RunSpec, how: str) -> None:
         """Say that a run is over."""
         self.ended_runs += 1
-        self.steps[spec.run_id] = self.store.steps(spec)
-        number = f"[{self.ended_runs}/{len(self.specs)}]"
-        line = f"{number} {spec.run_id}  {how}"
+        done = self.store.is_done(spec)  # whole updates may end short of the total
+        self.steps[spec.run_id] = spec.args["total_timesteps"] if done else self.store.steps(spec)
+        line = f"[{self.ended_runs}/{len(self.specs)}] {spec.run_id}  {how}"
         self.bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
 
     def update(self, running: list[RunSpec]) -> None:
         """Show how far all is, at most every half second, or every half minute in plain lines."""
         now = time.monotonic()
-        interval = LIVE_INTERVAL if self.console.is_terminal else PLAIN_INTERVAL
+        interval = LIVE_INTERVAL if self.console.is_interactive else PLAIN_INTERVAL
         if now - max(self.shown, self.started) < interval:
             return
         self.shown = now
         self.steps |= {spec.run_id: self.store.steps(spec) for spec in running}
-        done = sum(self.steps.values())
-        rate = (done - self.first) / (now - self.started)
+        line = self._show()
+        if not self.console.is_interactive:
+            self.console.print(line, highlight=False, soft_wrap=True)
+
+    def _show(self) -> str:
+        done, seconds = sum(self.steps.values()), time.monotonic() - self.started
+        rate = (done - self.first) / seconds if seconds else 0.0
         left = f"{duration((self.total - done) / rate)} left" if rate else "starting"
         what, speed = f"{self.ended_runs}/{len(self.specs)} runs", f"{rate:,.0f} steps/s, {left}"
         self.bar.update(self.task, completed=done, description=what, speed=speed)
-        if not self.console.is_terminal:
-            percent = f"{100 * done / self.total:.0f}%"
-            self.console.print(f"{what}  {percent}  {speed}", highlight=False, soft_wrap=True)
+        return f"{what}  {100 * done / self.total:.0f}%  {speed}"
 
 
 def duration(seconds: float) -> str:

@@ -44,3 +44,21 @@ def estimate_mean(values: np.ndarray, seed: int = 0) -> Estimate:
     )  # fmt: skip
     low, high = result.confidence_interval
     return Estimate(float(values.mean()), float(low), float(high), len(values))
+
+
+def interval_of_means(values: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """95% percentile-bootstrap interval of the mean of each row of `values`, `[rows, agents]`.
+
+    Agents are resampled, the same ones for all rows. NaN entries (no episode ended) do not count.
+    """
+    rng, (rows, agents) = np.random.default_rng(seed), values.shape
+    counts = rng.multinomial(
+        agents, np.full(agents, 1 / agents), size=1000
+    ).T  # [agents, resamples]
+    present = ~np.isnan(values)
+    with np.errstate(invalid="ignore"):
+        means = np.nan_to_num(values) @ counts / (present @ counts)  # [rows, resamples]
+    low, high = np.full(rows, np.nan), np.full(rows, np.nan)
+    some = present.any(axis=1)
+    low[some], high[some] = np.nanpercentile(means[some], (2.5, 97.5), axis=1)
+    return low, high

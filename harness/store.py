@@ -13,6 +13,7 @@ import hashlib
 import io
 import json
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ import pandas as pd
 
 from harness.suite import RunSpec
 
-STATES = ("done", "running", "failed", "interrupted", "pending")
+STATES = ("done", "running", "failed", "interrupted", "pending", "changed")
 
 
 class StoreError(RuntimeError):
@@ -43,26 +44,31 @@ class Store:
         return path
 
     def state(self, spec: RunSpec) -> str:
-        """One of STATES.
-
-        Raises:
-            StoreError: The folder holds a run of another configuration.
-        """
+        """One of STATES; "changed" where the folder holds a run of another configuration."""
         saved = _read_json(self.path(spec, "spec.json"))
         if saved is None:
             return "pending"
         if saved["hash"] != spec.hash:
-            raise StoreError(
-                f"{self.path(spec)} was run with another configuration "
-                f"({_difference(saved, spec)}): name another --results-dir, or remove it"
-            )
-        done = _read_json(self.path(spec, "done.json"))
-        if done is not None and done["hash"] == spec.hash:
+            return "changed"
+        if self.is_done(spec):
             return "done"
         with self.lock(spec) as lock:
             if lock is None:
                 return "running"
         return "failed" if self.path(spec, "failed.json").exists() else "interrupted"
+
+    def is_done(self, spec: RunSpec) -> bool:
+        done = _read_json(self.path(spec, "done.json"))
+        return done is not None and done["hash"] == spec.hash
+
+    def refuse_changed(self, spec: RunSpec) -> None:
+        """Raise StoreError if the folder holds a run of another configuration."""
+        saved = _read_json(self.path(spec, "spec.json"))
+        if saved is not None and saved["hash"] != spec.hash:
+            raise StoreError(
+                f"{self.path(spec)} was run with another configuration "
+                f"({_difference(saved, spec)}): name another --results-dir, or remove it"
+            )
 
     @contextlib.contextmanager
     def lock(self, spec: RunSpec) -> Iterator[int | None]:
@@ -74,12 +80,7 @@ class Store:
         self.path(spec).mkdir(parents=True, exist_ok=True)
         descriptor = os.open(self.path(spec, "lock"), os.O_RDWR | os.O_CREAT)
         try:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                yield None
-            else:
-                yield descriptor
+            yield descriptor if _flock(descriptor) else None
         finally:
             os.close(descriptor)
 
@@ -128,6 +129,17 @@ class Store:
         except FileNotFoundError:
             return "(no log)"
         return "\n".join(text.splitlines()[-lines:])
+
+
+def _flock(descriptor: int) -> bool:
+    for _ in range(5):  # `state` holds a lock too, but for an instant
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            time.sleep(0.02)
+        else:
+            return True
+    return False
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

@@ -19,6 +19,7 @@ import gymnasium as gym
 SUITES = Path(__file__).parent / "suites"
 REQUIRED = {"title", "reports", "seeds", "agents", "args", "algorithms", "environments"}
 KEYS = REQUIRED | {"note"}
+ALGORITHM_KEYS = {"name", "baseline", "args"}
 
 
 class SuiteError(ValueError):
@@ -105,9 +106,13 @@ def load_suite(
     Raises:
         SuiteError: An unknown suite, environment, baseline or argument, or a bad value.
     """
+    for flag, value in (("total_timesteps", total_timesteps), ("seeds", seeds), ("agents", agents)):
+        if value is not None and value < 1:
+            raise SuiteError(f"{flag} must be at least 1, got {value}")
     path = Path(name) if name.endswith(".toml") else SUITES / f"{name}.toml"
     if not path.exists():
-        raise SuiteError(f"no suite {name!r}: there are {', '.join(suite_names())}")
+        known = f"there are {', '.join(suite_names())}"
+        raise SuiteError(f"no file {name}" if path == Path(name) else f"no suite {name!r}: {known}")
     try:
         data = tomllib.loads(path.read_text())
     except tomllib.TOMLDecodeError as error:
@@ -115,15 +120,28 @@ def load_suite(
     _known(data, KEYS, f"{path.name}: key")
     for key in sorted(REQUIRED - set(data)):
         raise SuiteError(f"{path.name} needs the key {key!r}")
+    for key, hint in (("seeds", tuple[int, ...]), ("agents", int), ("args", dict)):
+        if not _fits(data[key], hint):
+            raise SuiteError(f"{path.name}: {key} must be of type {hint}, got {data[key]!r}")
+    if "total_timesteps" not in data["args"]:
+        raise SuiteError(f"{path.name}: args needs total_timesteps")
     _known(dict.fromkeys(env), set(data["environments"]), "environment")
+    if seeds is not None and seeds > len(data["seeds"]):
+        raise SuiteError(f"{path.name} has {len(data['seeds'])} seeds, fewer than {seeds}")
     environments = {k: v for k, v in data["environments"].items() if k in env or not env}
-    common = data["args"] | ({"total_timesteps": total_timesteps} if total_timesteps else {})
+    common = data["args"] | (
+        {} if total_timesteps is None else {"total_timesteps": total_timesteps}
+    )
     runs = []
     for algorithm in data["algorithms"]:
+        _known(algorithm, ALGORITHM_KEYS, f"{path.name}: key of an algorithm")
+        for key in sorted({"name", "baseline"} - set(algorithm)):
+            raise SuiteError(f"{path.name}: an algorithm needs the key {key!r}")
         for environment, env_id in environments.items():
             args = {"env_id": env_id, **common, **algorithm.get("args", {})}
             where = f"{path.name}: {algorithm['name']} on {environment}"
-            check_args(algorithm["baseline"], args, where)
+            for seed in data["seeds"]:
+                check_args(algorithm["baseline"], {**args, "seed": seed, "agent": 0}, where)
             runs += [
                 RunSpec(
                     suite=path.stem,
@@ -137,6 +155,8 @@ def load_suite(
             ]
     if not runs:
         raise SuiteError(f"{path.name} has no runs: it needs algorithms, environments and seeds")
+    if len({run.run_id for run in runs}) < len(runs):
+        raise SuiteError(f"{path.name}: names of algorithms and seeds must differ from each other")
     return Suite(
         name=path.stem,
         title=data["title"],

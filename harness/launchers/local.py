@@ -55,11 +55,14 @@ def run_local(specs: list[RunSpec], store: Store, jobs: int, progress: Progress)
             while waiting and len(children) < jobs:
                 spec = waiting.popleft()
                 child = _start(spec, store)
-                if child is None:
-                    outcome.held.append(spec)
-                    progress.ended(spec, "run by another process")
-                else:
+                if child is not None:
                     children.append(child)
+                elif store.is_done(spec):
+                    outcome.done.append(spec)
+                    progress.ended(spec, "done by another process")
+                else:
+                    outcome.held.append(spec)
+                    progress.ended(spec, "being run by another process")
             for child in [c for c in children if c.process.poll() is not None]:
                 children.remove(child)
                 seconds = time.monotonic() - child.started
@@ -76,7 +79,7 @@ def run_local(specs: list[RunSpec], store: Store, jobs: int, progress: Progress)
 def _start(spec: RunSpec, store: Store) -> _Child | None:
     with contextlib.ExitStack() as stack:
         lock = stack.enter_context(store.lock(spec))
-        if lock is None:
+        if lock is None or store.is_done(spec):  # by another launcher since the plan was made
             return None
         words = command(spec, store)
         store.start(spec, words)

@@ -11,71 +11,79 @@ import pandas as pd
 mpl.use("agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from harness.store import Store
-from harness.suite import Suite
+from harness.report.results import Results
+from harness.statistics import interval_of_means
 
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")  # Okabe and Ito's, told apart by all
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # Okabe and Ito's
 COLUMNS = 4
+POINTS = 100  # of a curve, at most
 MEASURES = (("charts/episodic_return", "reward"), ("conditioning/psi", "psi"))
 
 
-def learning_curves(suite: Suite, store: Store, path: Path) -> None:
-    """Mean over agents, each agent as a thin line behind it, written as a PNG."""
-    blocks = -(-len(suite.environments) // COLUMNS)
-    columns = min(COLUMNS, len(suite.environments))
+def learning_curves(results: Results, algorithms: list[str], path: Path) -> None:
+    """Mean over agents with its 95% interval, for each task that has runs, as a PNG."""
+    tasks = [
+        environment
+        for environment in results.suite.environments
+        if any(results.of(environment, algorithm) for algorithm in algorithms)
+    ]
+    columns = max(1, min(COLUMNS, len(tasks)))
+    blocks = max(1, -(-len(tasks) // columns))
     figure, axes = plt.subplots(
-        2 * blocks, columns, figsize=(3.4 * columns, 4.2 * blocks),
+        2 * blocks, columns, figsize=(max(3.4 * columns, 5), 4.2 * blocks),
         squeeze=False, sharex=True, layout="constrained",
     )  # fmt: skip
     for axis in axes.flat:
         axis.set_visible(False)
-    for i, environment in enumerate(suite.environments):
+    if not tasks:
+        figure.text(0.5, 0.5, "no runs yet", ha="center")
+    for i, task in enumerate(tasks):
         block, column = divmod(i, columns)
         for j, (measure, label) in enumerate(MEASURES):
             axis = axes[2 * block + j, column]
             axis.set_visible(True)
-            for algorithm, color in zip(suite.algorithms, COLORS, strict=False):
-                _draw(
-                    axis,
-                    agent_curves(suite, store, environment, algorithm, measure),
-                    algorithm,
-                    color,
-                )
-            axis.spines[["top", "right"]].set_visible(False)
-            axis.grid(alpha=0.25)
-            if column == 0:
-                axis.set_ylabel(label)
-            if j == 0:
-                axis.set_title(environment, fontsize=11)
-            if block == blocks - 1 and j == 1:
-                axis.set_xlabel("environment steps")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    if handles:
-        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-
-
-def agent_curves(
-    suite: Suite, store: Store, environment: str, algorithm: str, measure: str
-) -> pd.DataFrame:
-    """A row for each step count, a column for each agent."""
-    columns = {}
-    for spec in suite.runs:
-        if (spec.environment, spec.algorithm) == (environment, algorithm):
-            metrics = store.metrics(spec)
-            if metrics is not None:
-                columns[spec.run_id] = metrics.set_index("global_step")[measure]
-    return pd.DataFrame(columns)
+            tidy(axis)
+            for algorithm, color in zip(algorithms, COLORS, strict=False):
+                _draw(axis, results.curves(task, algorithm, measure), algorithm, color)
+            axis.set_ylabel(label if column == 0 else "")
+            axis.set_title(task if j == 0 else "", fontsize=11)
+            axis.set_xlabel("environment steps" if j and i + columns >= len(tasks) else "")
+            axis.tick_params(labelbottom=True)
+    save(figure, path)
 
 
 def _draw(axis: Axes, curves: pd.DataFrame, label: str, color: str) -> None:
     if curves.empty:
         return
-    if curves.shape[1] > 1:
-        axis.plot(curves.index, curves.to_numpy(), color=color, linewidth=0.5, alpha=0.3)
+    every = -(-len(curves) // POINTS)  # a point is the mean of so many updates
+    curves = curves.groupby(np.arange(len(curves)) // every).mean().set_index(
+        curves.index[every - 1 :: every].append(curves.index[-1:])[: -(-len(curves) // every)]
+    )  # fmt: skip
     mean = curves.mean(axis=1)
-    few = np.count_nonzero(mean.notna()) <= 20
-    axis.plot(mean.index, mean, color=color, linewidth=1.6, label=label, marker="o" if few else "",
-              markersize=3)  # fmt: skip
+    marker = "o" if len(curves) <= 20 else ""
+    axis.plot(mean.index, mean, color=color, lw=1.6, label=label, marker=marker, markersize=3)
+    if curves.shape[1] > 1:
+        low, high = interval_of_means(curves.to_numpy())
+        axis.fill_between(mean.index, low, high, color=color, alpha=0.2, linewidth=0)
+
+
+def tidy(axis: Axes) -> None:
+    """The look that all figures share."""
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.grid(alpha=0.25)
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write the figure, with one legend for all of its axes above it."""
+    named = {}
+    for axis in figure.axes:
+        handles, labels = axis.get_legend_handles_labels()
+        named |= dict(zip(labels, handles, strict=True))
+    if named:
+        figure.legend(
+            named.values(), named.keys(), loc="outside upper center", ncols=4, frameon=False
+        )
+    figure.savefig(path, dpi=110)
+    plt.close(figure)

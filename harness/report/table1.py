@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import tomllib
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +14,8 @@ import numpy as np
 import pandas as pd
 from rich.table import Table
 
+from harness.report.results import Results
 from harness.statistics import Estimate, estimate_mean, final_score
-from harness.store import Store
 from harness.suite import Suite
 
 LAST_UPDATES = 100
@@ -33,7 +36,7 @@ class Cell:
     steps: int
     """environment steps of the agent that has done the fewest"""
     updates: int
-    """updates that the mean is over, at most"""
+    """updates that the mean of the agent with the fewest is over"""
     paper: float | None
 
     @property
@@ -50,67 +53,73 @@ def paper_numbers() -> dict[str, Any]:
     return tomllib.loads(path.read_text())["table1"]
 
 
-def make_cells(suite: Suite, store: Store) -> list[Cell]:
+def make_cells(results: Results) -> list[Cell]:
     """A cell for each environment and algorithm, from whatever has been run so far."""
-    paper, cells = paper_numbers(), []
-    for environment in suite.environments:
-        for algorithm in suite.algorithms:
-            specs = [
-                r for r in suite.runs if (r.environment, r.algorithm) == (environment, algorithm)
-            ]
-            found = [(s, m) for s in specs if (m := store.metrics(s)) is not None]
-            scored = [(s, m) for s, m in found if not np.isnan(final_score(m, LAST_UPDATES))]
-            cells.append(
-                Cell(
-                    environment=environment,
-                    algorithm=algorithm,
-                    estimate=estimate_mean(
-                        np.array([final_score(m, LAST_UPDATES) for _, m in scored])
-                    ),
-                    seeds=len({s.args["seed"] for s, _ in scored}),
-                    agents=len(scored),
-                    planned=len(specs),
-                    steps=min((int(m["global_step"].iloc[-1]) for _, m in found), default=0),
-                    updates=max((len(m.tail(LAST_UPDATES)) for _, m in found), default=0),
-                    paper=paper.get(algorithm, {}).get(environment),
-                )
+    suite, paper = results.suite, paper_numbers()
+    planned = Counter((run.environment, run.algorithm) for run in suite.runs)
+    seeds = {run.run_id: run.args["seed"] for run in suite.runs}
+    cells = []
+    for environment, algorithm in itertools.product(suite.environments, suite.algorithms):
+        if not planned[environment, algorithm]:
+            continue
+        found = results.of(environment, algorithm)
+        scores = {k: final_score(m, LAST_UPDATES) for k, m in found.items()}
+        scores = {k: score for k, score in scores.items() if not np.isnan(score)}
+        cells.append(
+            Cell(
+                environment=environment,
+                algorithm=algorithm,
+                estimate=estimate_mean(np.array(list(scores.values()))),
+                seeds=len({seeds[k] for k in scores}),
+                agents=len(scores),
+                planned=planned[environment, algorithm],
+                steps=min((int(m["global_step"].iloc[-1]) for m in found.values()), default=0),
+                updates=min((len(m.tail(LAST_UPDATES)) for m in found.values()), default=0),
+                paper=paper.get(algorithm, {}).get(environment),
             )
+        )
     return cells
 
 
-def notes(suite: Suite, cells: list[Cell]) -> list[str]:
+def notes(results: Results, cells: list[Cell]) -> list[str]:
     """What a reader must know before comparing."""
-    paper = paper_numbers()
-    lines = [suite.note] if suite.note else []
-    steps, updates = min(c.steps for c in cells), max(c.updates for c in cells)
-    most = max(c.steps for c in cells)
-    if most < paper["timesteps"]:
+    paper, run = paper_numbers(), [c for c in cells if c.agents]
+    lines = [results.suite.note] if results.suite.note else []
+    if any(c.steps < paper["timesteps"] for c in run):
         lines.append(
-            f"Steps done: {steps:,} to {most:,}, against the paper's {paper['timesteps']:,}. "
-            "These numbers cannot confirm or refute the paper's."
+            f"Steps done: {_span(c.steps for c in run)}; the paper's runs have "
+            f"{paper['timesteps']:,}. Shorter runs can neither confirm nor refute it."
         )
-    if updates < LAST_UPDATES:
+    if any(c.updates < LAST_UPDATES for c in run):
         lines.append(
-            f"The mean is over all updates, at most {updates}: fewer than the paper's 100."
+            f"Means are over all updates where a run has fewer than {LAST_UPDATES}: "
+            f"{_span(c.updates for c in run)} here."
         )
-    agents = sorted({c.agents for c in cells})
-    lines.append(
-        f"Agents per cell: {agents[0]}{f' to {agents[-1]}' if len(agents) > 1 else ''} over "
-        f"{max(c.seeds for c in cells)} seed(s); the paper has {paper['seeds']} seeds of "
-        f"{paper['agents']} agents. Brackets hold the 95% bootstrap interval over agents, "
-        "where there are two or more."
-    )
+    if run:
+        lines.append(
+            f"Agents in a cell: {_span(c.agents for c in run)}, over {_span(c.seeds for c in run)} "
+            f"seeds; the paper has {paper['agents']} for each of {paper['seeds']} seeds."
+        )
+    if any(c.agents > 1 for c in cells):
+        lines.append("Brackets hold the 95% bootstrap interval of the mean over agents.")
     missing = [f"{c.algorithm} on {c.environment}" for c in cells if not c.agents]
     partial = [
-        f"{c.algorithm} on {c.environment} ({c.agents}/{c.planned})"
+        f"{c.algorithm} on {c.environment} ({c.agents} of {c.planned})"
         for c in cells
         if 0 < c.agents < c.planned
     ]
     if missing:
         lines.append(f"Missing (–): {', '.join(missing)}.")
     if partial:
-        lines.append(f"Agents so far: {', '.join(partial)}.")
+        lines.append(f"Incomplete: {', '.join(partial)}.")
+    if results.changed:
+        lines.append(f"Left out, since run with other settings: {', '.join(results.changed)}.")
     return lines
+
+
+def _span(numbers: Iterable[int]) -> str:
+    found = sorted(set(numbers))
+    return f"{found[0]:,}" if len(found) == 1 else f"{found[0]:,} to {found[-1]:,}"
 
 
 def to_frame(cells: list[Cell]) -> pd.DataFrame:
@@ -128,32 +137,55 @@ def to_frame(cells: list[Cell]) -> pd.DataFrame:
 
 
 def _rows(suite: Suite, cells: list[Cell]) -> tuple[list[str], list[list[str]]]:
+    algorithms = [a for a in suite.algorithms if any(c.algorithm == a for c in cells)]
+    found = {(c.environment, c.algorithm): c for c in cells}
     header = ["task"]
-    for algorithm in suite.algorithms:
+    for algorithm in algorithms:
         header += [algorithm, f"{algorithm}, paper"]
     rows = []
     for environment in suite.environments:
         row = [environment]
-        for cell in (c for c in cells if c.environment == environment):
-            row += [cell.text, "–" if cell.paper is None else f"{cell.paper:.1f}"]
+        for algorithm in algorithms:
+            cell = found.get((environment, algorithm))
+            paper = cell.paper if cell else None
+            row += [cell.text if cell else "", "" if paper is None else f"{paper:.1f}"]
         rows.append(row)
     return header, rows
 
 
-def to_markdown(suite: Suite, cells: list[Cell]) -> str:
-    header, rows = _rows(suite, cells)
+def to_markdown(results: Results, cells: list[Cell]) -> str:
+    """The table and its notes, then how much each cell rests on."""
+    header, rows = _rows(results.suite, cells)
+    weights = [
+        [c.environment, c.algorithm, f"{c.agents} of {c.planned}", str(c.seeds), f"{c.steps:,}",
+         str(c.updates)] for c in cells
+    ]  # fmt: skip
+    return (
+        "\n\n".join(
+            [
+                f"# {results.suite.title}",
+                f"{paper_numbers()['metric'].capitalize()}.",
+                _markdown(header, rows),
+                "\n".join(f"- {line}" for line in notes(results, cells)),
+                "What each cell rests on:",
+                _markdown(["task", "algorithm", "agents", "seeds", "steps", "updates"], weights),
+            ]
+        )
+        + "\n"
+    )
+
+
+def _markdown(header: list[str], rows: list[list[str]]) -> str:
     lines = [header, ["---", *["--:"] * (len(header) - 1)], *rows]
-    table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
-    listed = "\n".join(f"- {line}" for line in notes(suite, cells))
-    return f"# {suite.title}\n\n{paper_numbers()['metric'].capitalize()}.\n\n{table}\n\n{listed}\n"
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def to_rich(suite: Suite, cells: list[Cell]) -> Table:
-    header, rows = _rows(suite, cells)
-    table = Table(title=f"Table 1 ({suite.name}): {paper_numbers()['metric']}")
+def to_rich(results: Results, cells: list[Cell]) -> Table:
+    header, rows = _rows(results.suite, cells)
+    table = Table(title=f"{results.suite.name}: {paper_numbers()['metric']}")
     for name in header:
-        table.add_column(name, justify="left" if name == "task" else "right",
-                         style="dim" if name.endswith("paper") else "")  # fmt: skip
+        justify, style = ("left", "") if name == "task" else ("right", "dim" * ("paper" in name))
+        table.add_column(name, justify=justify, style=style)  # type: ignore[arg-type]
     for row in rows:
         table.add_row(*row)
     return table

@@ -22,9 +22,10 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.utils import RunningMeanStd
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from baselines import ppo_reg
-from baselines.ppo_reg import Args, NormalizeObservation, Rollout, gae, policy_loss, train
+from baselines.ppo_reg import Args, NormalizeObservation, Rollout, RunError, gae, policy_loss, train
 
 FILE = Path(ppo_reg.__file__)
 SMALL = {"num_steps": 64, "num_minibatches": 4, "update_epochs": 2, "vf_epochs": 2}
@@ -136,7 +137,7 @@ def count_rollout(num_steps: int = 5, **ends) -> Rollout:
     envs = SyncVectorEnv([lambda: Count(**ends)], autoreset_mode=AutoresetMode.SAME_STEP)
     envs = gym.wrappers.vector.RecordEpisodeStatistics(envs)
     args = Args(env_id="Pendulum-v1", num_steps=num_steps, num_minibatches=1)
-    learner = ppo_reg.make_learner(Args(env_id="MountainCarContinuous-v0"))
+    learner = ppo_reg.Learner(Args(env_id="MountainCarContinuous-v0"))
     learner.actor = ppo_reg.Actor((1, 8, 1), torch.Generator())
     learner.critic = torch.nn.Linear(1, 1, bias=False)
     torch.nn.init.ones_(learner.critic.weight)
@@ -222,6 +223,19 @@ def test_the_critic_and_the_policy_see_perturbed_observations_and_the_statistics
     np.testing.assert_array_equal(stats_plain["obs_rms"].mean, stats_perturbed["obs_rms"].mean)
 
 
+def test_actions_of_any_shape_are_taken(tmp_path):
+    class Square(Count):
+        action_space = gym.spaces.Box(-1.0, 1.0, (2, 2), np.float32)
+
+        def step(self, action):
+            assert action.shape == (2, 2)
+            return super().step(action)
+
+    gym.register("test/Square-v0", Square)
+    learner = train(pendulum(tmp_path, env_id="test/Square-v0", total_timesteps=64))
+    assert learner.actor.log_std.shape == (4,)
+
+
 def test_observations_of_any_shape_are_flattened(tmp_path):
     gym.register(
         "test/Image-v0", lambda: gym.wrappers.ReshapeObservation(Count(truncate_at=9), (1, 1))
@@ -288,8 +302,8 @@ def test_psi_is_measured_once_per_update_on_the_new_policy_and_the_whole_rollout
     measured = []
     measure = ppo_reg.measure_conditioning
 
-    def spy(learner, obs):
-        logs = measure(learner, obs)
+    def spy(args, learner, obs):
+        logs = measure(args, learner, obs)
         measured.append((obs.shape[0], weights(learner), logs))
         return logs
 
@@ -328,7 +342,7 @@ def test_the_global_random_state_is_left_alone(tmp_path):
 def test_every_stream_is_different():
     args = [Args(seed=s, agent=a) for s, a in ((1, 0), (0, 1), (1, 1))]
     seeds = [tuple(ppo_reg.env_seeds(a, checkpoint)) for a in args for checkpoint in range(3)]
-    learners = [ppo_reg.make_learner(a) for a in args]
+    learners = [ppo_reg.Learner(a) for a in args]
     generators = [g for learner in learners for g in learner.generators.values()]
     generators += [
         x.generator for learner in learners for x in (learner.regularizer, learner.probe)
@@ -358,7 +372,15 @@ def interrupted(args: Args, monkeypatch, at_update: int) -> None:
 RESUMABLE = {"checkpoint_interval": 2, "total_timesteps": 7 * 64, "num_envs": 1}
 
 
-@pytest.mark.parametrize("changes", [{}, {"perturb_obs": True, "anneal_lr": True}, {"num_envs": 2}])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"perturb_obs": True, "anneal_lr": True},
+        {"num_envs": 2},
+        {"env_id": "HopperBulletEnv-v0", "log_spectrum": 3},
+    ],
+)
 @pytest.mark.parametrize("at_update", [1, 5])
 def test_a_resumed_run_is_bit_for_bit_the_undisturbed_one(
     tmp_path, monkeypatch, changes, at_update
@@ -397,16 +419,33 @@ def test_a_torn_checkpoint_falls_back_on_the_one_before_it(tmp_path, capsys):
 def test_a_run_without_a_readable_checkpoint_is_not_overwritten(tmp_path):
     train(pendulum(tmp_path))
     (tmp_path / "checkpoint.pt").write_bytes(b"torn")
-    with pytest.raises(ValueError, match="no readable checkpoint"):
+    with pytest.raises(RunError, match="no readable checkpoint"):
         train(pendulum(tmp_path, resume=True))
 
 
 def test_a_run_is_not_overwritten_by_another(tmp_path):
     train(pendulum(tmp_path))
-    with pytest.raises(ValueError, match="holds a run"):
+    with pytest.raises(RunError, match="holds a run"):
         train(pendulum(tmp_path))
-    with pytest.raises(ValueError, match=r"was run with gamma=0\.99, not 0\.9"):
+    with pytest.raises(RunError, match=r"was run with gamma=0\.99, not 0\.9"):
         train(pendulum(tmp_path, resume=True, gamma=0.9))
+
+
+def test_lost_rows_are_noticed(tmp_path, monkeypatch):
+    interrupted(pendulum(tmp_path, **RESUMABLE), monkeypatch, at_update=3)
+    (tmp_path / "metrics.csv").unlink()
+    with pytest.raises(RunError, match="lacks rows"):
+        train(pendulum(tmp_path, resume=True, **RESUMABLE))
+
+
+def test_tensorboard_has_what_metrics_csv_has_after_a_resume(tmp_path, monkeypatch):
+    interrupted(pendulum(tmp_path, **RESUMABLE), monkeypatch, at_update=5)
+    train(pendulum(tmp_path, resume=True, **RESUMABLE))
+    train(pendulum(tmp_path, resume=True, **RESUMABLE))
+    events = EventAccumulator(str(tmp_path)).Reload().Scalars("conditioning/psi")
+    rows = read_metrics(tmp_path)
+    assert [e.step for e in events] == [int(row["global_step"]) for row in rows]
+    assert [e.value for e in events] == pytest.approx([float(r["conditioning/psi"]) for r in rows])
 
 
 def test_a_checkpoint_holds_nothing_but_weights_and_numbers(tmp_path):
@@ -423,7 +462,7 @@ def test_a_malicious_checkpoint_is_not_executed(tmp_path):
             return Path.touch, (tmp_path / "executed",)
 
     torch.save({"args": Exploit()}, tmp_path / "checkpoint.pt")
-    with pytest.raises(ValueError, match="no readable checkpoint"):
+    with pytest.raises(RunError, match="no readable checkpoint"):
         train(pendulum(tmp_path, resume=True))
     assert not (tmp_path / "executed").exists()
 
@@ -476,19 +515,19 @@ def test_it_runs_when_copied_alone_into_an_empty_folder(tmp_path):
 
 @pytest.mark.parametrize("kill", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
 def test_a_killed_process_continues_as_if_undisturbed(tmp_path, kill):
-    program = Program(tmp_path, "--total-timesteps=2560", "--run-dir=killed")
+    program = Program(tmp_path, "--total-timesteps=1280", "--run-dir=killed")
     output = program.kill_after_checkpoint(tmp_path / "killed", kill)
     assert program.process.returncode != 0
     assert ("--resume continues" in output) == (kill != signal.SIGKILL)
-    assert len(read_metrics(tmp_path / "killed")) < 40
+    assert len(read_metrics(tmp_path / "killed")) < 20
     for folder in ("killed", "undisturbed"):
-        program = Program(tmp_path, "--total-timesteps=2560", f"--run-dir={folder}", "--resume")
-        assert "update 40/40" in program.wait()
+        program = Program(tmp_path, "--total-timesteps=1280", f"--run-dir={folder}", "--resume")
+        assert "update 20/20" in program.wait()
     assert without_speed(tmp_path / "killed") == without_speed(tmp_path / "undisturbed")
 
 
 def test_a_full_disk_loses_nothing(tmp_path):
-    flags = ("--total-timesteps=2560", "--run-dir=full", "--resume")
+    flags = ("--total-timesteps=1280", "--run-dir=full", "--resume")
     Program(tmp_path, *flags).kill_after_checkpoint(tmp_path / "full", signal.SIGKILL)
     before = (tmp_path / "full" / "checkpoint.pt").read_bytes()
 
@@ -499,15 +538,18 @@ def test_a_full_disk_loses_nothing(tmp_path):
     assert "File too large" in program.wait()
     assert program.process.returncode != 0
     assert (tmp_path / "full" / "checkpoint.pt").read_bytes() == before
-    assert "update 40/40" in Program(tmp_path, *flags).wait()
-    assert len(read_metrics(tmp_path / "full")) == 40
+    assert "update 20/20" in Program(tmp_path, *flags).wait()
+    assert len(read_metrics(tmp_path / "full")) == 20
 
 
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
         (["--gamma", "1.5"], "gamma must be in [0, 1], got 1.5"),
-        (["--num-envs", "0"], "num_envs must be above 0, got 0"),
+        (["--hidden-sizes", "0"], "hidden_sizes must be at least 1"),
+        (["--seed", "-1"], "seed must be at least 0, got -1"),
+        (["--env-id", "Hoper-v0"], "Hoper"),
+        (["--num-envs", "0"], "num_envs must be at least 1, got 0"),
         (["--num-minibatches", "7"], "num_minibatches must divide num_envs * num_steps = 2000"),
         (["--total-timesteps", "10"], "total_timesteps must be at least"),
         (["--coefficient", "-1"], "coefficient must be finite and at least 0, got -1.0"),
@@ -546,4 +588,4 @@ def test_it_learns(tmp_path):
 def test_videos_are_recorded(tmp_path):
     changes = {"env_id": "ReacherBulletEnv-v0", "num_steps": 200, "total_timesteps": 200}
     train(pendulum(tmp_path, **changes, capture_video=True))
-    assert [v.stat().st_size > 1000 for v in (tmp_path / "videos").glob("*.mp4")]
+    assert any(v.stat().st_size > 1000 for v in (tmp_path / "videos").glob("*.mp4"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 
@@ -67,7 +68,7 @@ def test_run_all_ends_with_the_log_of_what_failed(run_cli, store, suite, small):
 
 def test_run_all_says_what_the_other_suites_would_take(run_cli, store, small):
     _, out = run_cli("run-all", *small)
-    assert "run-all --suite table1: 480 runs, 2,400,000,000 steps" in out
+    assert "To come: run-all --suite table1 takes 480 runs, 2,400,000,000 steps." in out
 
 
 def test_a_changed_configuration_is_refused_before_anything_starts(run_cli, store, suite, small):
@@ -84,8 +85,26 @@ def test_status_counts_states(run_cli, store, suite, suite_file):
     status, out = run_cli("status", "--suite", suite_file, "--results-dir", store.root)
     row = next(line for line in out.splitlines() if "tiny" in line)
     assert status == 0
-    assert [int(x) for x in row.replace("│", " ").split()[1:6]] == [1, 0, 0, 1, 14]
+    assert [int(x) for x in row.replace("│", " ").split()[1:7]] == [1, 0, 0, 1, 14, 0]
     assert "200 of 3,200" in row
+
+
+def test_status_goes_on_where_the_settings_were_others(run_cli, store, suite):
+    changed = dataclasses.replace(suite.runs[0], suite="smoke", args=suite.runs[0].args | {"x": 1})
+    write_run(store, changed, [1.0])
+    status, out = run_cli("status", "--results-dir", store.root)
+    row = next(line for line in out.splitlines() if "smoke" in line)
+    assert status == 0
+    assert row.replace("│", " ").split()[6] == "1"
+    assert "table1" in out
+
+
+def test_a_part_of_a_suite_does_not_hide_the_rest_of_the_report(run_cli, store, suite, small):
+    for spec in suite.runs:
+        write_run(store, spec, [1.0])
+    _, out = run_cli("run-all", *small)
+    assert "Reacher" in out
+    assert (store.root / "tiny" / "report" / "table1.csv").read_text().count("\n") == 5
 
 
 def test_list_names_every_suite(run_cli):
@@ -95,7 +114,7 @@ def test_list_names_every_suite(run_cli):
 
 def test_report_of_an_unfinished_suite(run_cli, store, suite, suite_file):
     write_run(store, suite.runs[0], [1.0, 2.0])
-    status, out = run_cli("report", suite_file, "--results-dir", store.root)
+    status, out = run_cli("report", "--suite", suite_file, "--results-dir", store.root)
     assert status == 0
     assert "1.5" in out
     assert "Missing" in out

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from harness.statistics import estimate_mean, final_score
+from harness.statistics import estimate_mean, final_score, interval_of_means
 
 
 def test_the_final_score_is_the_mean_of_the_last_updates_in_which_an_episode_ended():
@@ -52,3 +52,18 @@ def test_equal_values_have_no_spread():
 def test_too_few_values_have_no_interval(values, mean):
     estimate = estimate_mean(np.array(values))
     np.testing.assert_equal(estimate, (mean, np.nan, np.nan, len(values)))
+
+
+def test_intervals_of_rows_are_those_of_each_row():
+    values = np.random.default_rng(3).normal(size=(4, 50)) + np.arange(4)[:, None]
+    low, high = interval_of_means(values)
+    for i, row in enumerate(values):
+        estimate = estimate_mean(row)
+        assert low[i] == pytest.approx(estimate.low, abs=0.05)
+        assert high[i] == pytest.approx(estimate.high, abs=0.05)
+
+
+def test_missing_entries_of_a_row_do_not_count():
+    low, high = interval_of_means(np.array([[1.0, np.nan, 1.0], [np.nan] * 3]))
+    np.testing.assert_equal(low, [1.0, np.nan])
+    np.testing.assert_equal(high, [1.0, np.nan])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import threading
 
 import pytest
 
@@ -41,12 +42,35 @@ def test_a_locked_run_is_running(store, suite):
     assert store.state(spec) == "interrupted"
 
 
+def test_asking_for_the_state_does_not_make_another_give_a_run_up(store, suite):
+    """The question takes the lock for an instant, and whoever wants the run waits for longer."""
+    spec = suite.runs[0]
+    store.start(spec, ["true"])
+    stop = threading.Event()
+
+    def ask() -> None:
+        while not stop.is_set():
+            store.state(spec)
+
+    asking = threading.Thread(target=ask)
+    asking.start()
+    try:
+        for _ in range(200):
+            with store.lock(spec) as lock:
+                assert lock is not None
+    finally:
+        stop.set()
+        asking.join()
+
+
 def test_another_configuration_is_not_taken_for_a_finished_run(store, suite):
     spec = suite.runs[0]
     write_run(store, spec, [1.0])
     changed = dataclasses.replace(spec, args={**spec.args, "gamma": 0.9})
+    assert store.state(changed) == "changed"
+    store.refuse_changed(spec)
     with pytest.raises(StoreError, match=r"gamma None -> 0\.9.*--results-dir"):
-        store.state(changed)
+        store.refuse_changed(changed)
 
 
 def test_checksums_are_of_the_files(store, suite):

@@ -49,6 +49,17 @@ def test_it_scales_down(suite_file):
     assert suite.timesteps == 200
 
 
+@pytest.mark.parametrize("flag", ["total_timesteps", "seeds", "agents"])
+def test_counts_start_at_1(suite_file, flag):
+    with pytest.raises(SuiteError, match=f"{flag} must be at least 1, got 0"):
+        load_suite(str(suite_file), **{flag: 0})
+
+
+def test_it_does_not_scale_up_seeds_in_silence(suite_file):
+    with pytest.raises(SuiteError, match=r"has 2 seeds, fewer than 3"):
+        load_suite(str(suite_file), seeds=3)
+
+
 def test_table1_is_the_papers_plan():
     suite = load_suite("table1")
     assert len(suite.environments) == 8
@@ -76,6 +87,18 @@ def test_table1_is_the_papers_plan():
         ("[args]", "[args", "not valid TOML"),
         ("agents = 2\n", "", "needs the key 'agents'"),
         ("[1, 2]", "[]", "no runs"),
+        ("[1, 2]", "[1, 1]", "must differ"),
+        ("[1, 2]", "[-1]", "seed must be at least 0, got -1"),
+        ("[1, 2]", "1", "seeds must be of type .*got 1"),
+        ("agents = 2", 'agents = "2"', "agents must be of type .*got '2'"),
+        ("total_timesteps = 200\n", "", "args needs total_timesteps"),
+        (
+            "args = { coefficient",
+            "arg = { coefficient",
+            "key of an algorithm 'arg' is unknown: args?",
+        ),
+        ('name = "PPO reg"\n', "", "an algorithm needs the key 'name'"),
+        ('name = "PPO reg"', 'name = "PPO"', "must differ"),
     ],
 )
 def test_a_bad_suite_is_refused_and_the_reason_told(suite_file, old, new, message):
@@ -88,5 +111,7 @@ def test_a_bad_suite_is_refused_and_the_reason_told(suite_file, old, new, messag
 def test_unknown_names_are_refused(suite_file):
     with pytest.raises(SuiteError, match=r"no suite 'tabel1': there are .*table1"):
         load_suite("tabel1")
+    with pytest.raises(SuiteError, match=r"no file tabel1\.toml"):
+        load_suite("tabel1.toml")
     with pytest.raises(SuiteError, match=r"environment 'Hoper' is unknown: Hopper\?"):
         load_suite(str(suite_file), env=("Hoper",))

@@ -16,6 +16,9 @@ from rich.console import Console
 
 from harness.launchers.local import ROOT, command, run_local
 from harness.progress import Progress
+from harness.store import Store
+from harness.suite import load_suite
+from tests.harness.conftest import write_run
 
 
 def run(specs, store, jobs=2):
@@ -46,10 +49,10 @@ def wait_for(condition, process: subprocess.Popen, seconds: float = 120) -> None
         time.sleep(0.05)
 
 
-def running(results: Path) -> list[str]:
-    """Command lines of the baselines that write to this folder."""
-    found = subprocess.run(["pgrep", "-af", f"run-dir {results}"], capture_output=True, text=True)
-    return [line for line in found.stdout.splitlines() if "baselines" in line]
+def running(suite_file: Path, results: Path) -> list[str]:
+    """Ids of the runs that some process holds."""
+    plan = load_suite(str(suite_file), total_timesteps=20_000, seeds=1, agents=1, env=("Hopper",))
+    return [run.run_id for run in plan.runs if Store(results).state(run) == "running"]
 
 
 def test_runs_finish_and_leave_what_the_store_promises(store, suite):
@@ -81,6 +84,15 @@ def test_a_run_that_another_process_holds_is_left_to_it(store, suite):
     assert (outcome.held, outcome.done) == ([held], [free])
 
 
+def test_a_run_that_another_launcher_has_finished_is_not_run_again(store, suite):
+    spec = suite.runs[0]
+    write_run(store, spec, [1.0])
+    before = store.path(spec, "done.json").read_text()
+    assert run([spec], store).done == [spec]
+    assert store.path(spec, "done.json").read_text() == before
+    assert not store.path(spec, "log.txt").exists()
+
+
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
 def test_stopping_run_all_stops_the_runs_and_keeps_their_checkpoints(suite_file, tmp_path, stop):
     results = tmp_path / "results"
@@ -88,9 +100,9 @@ def test_stopping_run_all_stops_the_runs_and_keeps_their_checkpoints(suite_file,
     wait_for(lambda: len(checkpoints(results)) == 2, process)
     process.send_signal(stop)
     assert process.wait(30) == 130
-    assert not running(results)
+    assert not running(suite_file, results)
     assert len(checkpoints(results)) == 2
-    assert "the same command continues" in (tmp_path / "out.txt").read_text()
+    assert "the same command continues from" in (tmp_path / "out.txt").read_text()
     assert start_run_all(suite_file, results).wait() == 0
     for folder in results.glob("tiny/ppo*"):
         steps = [int(row.split(",")[0]) for row in (folder / "metrics.csv").read_text().split()[1:]]
@@ -104,11 +116,14 @@ def test_runs_whose_launcher_was_killed_are_not_started_twice(suite_file, tmp_pa
     wait_for(lambda: len(checkpoints(results)) == 2, process)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    try:
-        assert len(running(results)) == 2
-        second = start_run_all(suite_file, results)
-        assert second.wait(60) == 0
-        assert "2 runs are being run by another process" in (tmp_path / "out.txt").read_text()
-    finally:
-        for line in running(results):
-            os.kill(int(line.split()[0]), signal.SIGKILL)
+    assert len(running(suite_file, results)) == 2
+    second = start_run_all(suite_file, results)
+    assert second.wait(60) == 0
+    assert "2 runs are being run by another process" in (tmp_path / "out.txt").read_text()
+    wait_for_end = time.monotonic() + 120  # the orphans go on, and finish
+    while running(suite_file, results):
+        assert time.monotonic() < wait_for_end
+        time.sleep(0.2)
+    assert [path.read_text().count("\n") for path in results.glob("tiny/*/metrics.csv")] == [
+        201
+    ] * 2

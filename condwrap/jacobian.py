@@ -1,0 +1,46 @@
+"""A policy as a function of delta alone, and its Jacobian there, one chunk of states at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.func import vjp, vmap
+
+from condwrap.observation import States
+from condwrap.policy import Output, Policy, check_output, flat_output, untouched
+
+
+def read_states(obs: Any, output: Output) -> States:
+    """The observations, `[B, *obs_shape]` or a dict of such, checked as the regularizer does."""
+    check_output(output)
+    return States.read(obs, obs_scale=None, batch_ndim=1)
+
+
+def response(policy: Policy, states: States, output: Output) -> Callable[[Tensor], Tensor]:
+    """The map from delta, `[B, n]`, to the output that counts, `[B, m]`."""
+
+    def respond(delta: Tensor) -> Tensor:
+        shifts = states.displacement(delta)
+        moved = [x + shift for x, shift in zip(states.perturbed, shifts, strict=True)]
+        with untouched(policy, states.device), torch.autocast(states.device.type, enabled=False):
+            return flat_output(policy(states.obs(moved)), output, states.batch)
+
+    return respond
+
+
+def zero_delta(states: States) -> Tensor:
+    """Where the Jacobian is taken, `[B, n]`."""
+    return torch.zeros(*states.batch, sum(states.sizes), dtype=states.dtype, device=states.device)
+
+
+def jacobians(policy: Policy, states: States, output: Output, chunk_size: int) -> Iterator[Tensor]:
+    """Jacobians of the states, `[chunk, m, n]`, by m vector-Jacobian products for each chunk."""
+    for chunk in states.chunks(chunk_size):
+        answer, pullback = vjp(response(policy, chunk, output), zero_delta(chunk))[:2]
+        m = answer.shape[-1]
+        rows = torch.eye(m, dtype=answer.dtype, device=answer.device)
+        cotangents = rows[:, None].expand(m, *answer.shape)  # output k of every state at once
+        yield vmap(lambda row, pullback=pullback: pullback(row)[0])(cotangents).movedim(0, 1)
