@@ -15,7 +15,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import functools
-import itertools
 import math
 import os
 import signal
@@ -23,7 +22,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -85,7 +84,11 @@ class Args:
     max_grad_norm: float = 0.5
     """length that the gradient of the critic is clipped to"""
     hidden_sizes: tuple[int, ...] = (64, 64)
-    """widths of the tanh layers, of the policy and of the critic"""
+    """widths of the hidden layers, of the policy and of the critic"""
+    activation: Literal["tanh", "relu"] = "tanh"
+    """what follows each hidden layer"""
+    log_std_init: float = 0.0
+    """log of the policy's standard deviation at the start"""
     norm_obs: bool = True
     """normalize observations by their running mean and variance, clipped to [-10, 10]"""
     norm_reward: bool = True
@@ -248,26 +251,28 @@ def env_seeds(args: Args, checkpoint: int) -> list[int]:
 # --- agent ----------------------------------------------------------------------------------------
 
 
-def make_mlp(sizes: tuple[int, ...], last_gain: float, generator: torch.Generator) -> nn.Sequential:
-    """Tanh layers with orthogonal weights, drawn from the generator and no global state."""
+ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU}
+
+
+def make_mlp(args: Args, n_in: int, n_out: int, gain: float, rng: torch.Generator) -> nn.Sequential:
+    """Layers with orthogonal weights, `gain` at the output, drawn from no global state."""
     layers: list[nn.Module] = []
-    for n_in, n_out in itertools.pairwise(sizes):
-        linear = nn.utils.skip_init(nn.Linear, n_in, n_out)
-        nn.init.orthogonal_(linear.weight, math.sqrt(2), generator)
+    sizes = (n_in, *args.hidden_sizes, n_out)
+    for i, size in enumerate(sizes[1:]):
+        linear = nn.utils.skip_init(nn.Linear, sizes[i], size)
+        nn.init.orthogonal_(linear.weight, gain if i == len(sizes) - 2 else math.sqrt(2), rng)
         nn.init.zeros_(linear.bias)
-        layers += [linear, nn.Tanh()]
-    with torch.no_grad():
-        layers[-2].weight *= last_gain / math.sqrt(2)
+        layers += [linear, ACTIVATIONS[args.activation]()]
     return nn.Sequential(*layers[:-1])
 
 
 class Actor(nn.Module):
     """Gaussian policy: a mean for each observation, one log-std for each action."""
 
-    def __init__(self, sizes: tuple[int, ...], generator: torch.Generator) -> None:
+    def __init__(self, args: Args, obs_dim: int, action_dim: int, rng: torch.Generator) -> None:
         super().__init__()
-        self.mean = make_mlp(sizes, 0.01, generator)
-        self.log_std = nn.Parameter(torch.zeros(sizes[-1]))
+        self.mean = make_mlp(args, obs_dim, action_dim, 0.01, rng)
+        self.log_std = nn.Parameter(torch.full((action_dim,), args.log_std_init))
 
     def forward(self, obs: Tensor) -> Independent:
         mean = self.mean(obs)
@@ -488,8 +493,8 @@ class Learner:
             n: int(s.generate_state(1, np.uint64)[0]) for n, s in zip(names, streams, strict=True)
         }
         self.generators = {n: torch.Generator().manual_seed(seeds[n]) for n in names[:3]}
-        self.actor = Actor((obs_dim, *args.hidden_sizes, action_dim), self.generators["init"])
-        self.critic = make_mlp((obs_dim, *args.hidden_sizes, 1), 1.0, self.generators["init"])
+        self.actor = Actor(args, obs_dim, action_dim, self.generators["init"])
+        self.critic = make_mlp(args, obs_dim, 1, 1.0, self.generators["init"])
         adam = functools.partial(torch.optim.Adam, eps=1e-5)
         self.critic_optimizer = adam(self.critic.parameters(), args.vf_learning_rate)
         self.regularizer = args.regularizer(args.coefficient, seeds["penalty"])  # condwrap

@@ -110,10 +110,10 @@ def safe_norm(x: Array) -> Array:
     """Euclidean norm over the last axis, `[..., n]` to `[...]`, with gradient 0 at 0."""
     xp = namespace(x=x)
     squares = xp.sum(x * x, axis=-1)
-    positive = squares > 0
+    zero = squares == 0  # not squares > 0: a NaN stays one
     # Two `where`s: with one alone, JAX multiplies the infinite slope of sqrt at 0 by 0.
-    root = xp.sqrt(xp.where(positive, squares, xp.ones_like(squares)))
-    return xp.where(positive, root, xp.zeros_like(squares))
+    root = xp.sqrt(xp.where(zero, xp.ones_like(squares), squares))
+    return xp.where(zero, xp.zeros_like(squares), root)
 
 
 def _flatten(xp: Any, x: Array, batch_ndim: int) -> Array:

@@ -36,11 +36,25 @@ def zero_delta(states: States) -> Tensor:
     return torch.zeros(*states.batch, sum(states.sizes), dtype=states.dtype, device=states.device)
 
 
+def pullback(
+    policy: Policy, states: States, output: Output
+) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+    """The output, `[B, m]`, and the map from w, `[B, m]`, to Jᵀ w, `[B, n]`."""
+    answer, pull = vjp(response(policy, states, output), zero_delta(states))[:2]
+
+    def product(w: Tensor) -> Tensor:
+        with torch.autocast(states.device.type, enabled=False):  # the backward pass heeds it too
+            transposed: Tensor = pull(w)[0]
+            return transposed
+
+    return answer, product
+
+
 def jacobians(policy: Policy, states: States, output: Output, chunk_size: int) -> Iterator[Tensor]:
     """Jacobians of the states, `[chunk, m, n]`, by m vector-Jacobian products for each chunk."""
     for chunk in states.chunks(chunk_size):
-        answer, pullback = vjp(response(policy, chunk, output), zero_delta(chunk))[:2]
+        answer, product = pullback(policy, chunk, output)
         m = answer.shape[-1]
         rows = torch.eye(m, dtype=answer.dtype, device=answer.device)
         cotangents = rows[:, None].expand(m, *answer.shape)  # output k of every state at once
-        yield vmap(lambda row, pullback=pullback: pullback(row)[0])(cotangents).movedim(0, 1)
+        yield vmap(product)(cotangents).movedim(0, 1)

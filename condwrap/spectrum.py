@@ -14,10 +14,10 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.func import jvp, vjp, vmap
+from torch.func import jvp, vmap
 
 from condwrap.functional import safe_norm
-from condwrap.jacobian import jacobians, read_states, response, zero_delta
+from condwrap.jacobian import jacobians, pullback, read_states, response, zero_delta
 from condwrap.policy import Output, Policy
 
 
@@ -47,7 +47,7 @@ def jacobian_singular_values(
         [[3.0, 2.0]]
     """
     parts = _jacobians(policy, obs, output, chunk_size)
-    return torch.cat([_singular_values(jacobian) for jacobian in parts])
+    return torch.cat(list(map(_singular_values, parts)))  # a loop's name would hold a second chunk
 
 
 def condition_number(
@@ -55,7 +55,8 @@ def condition_number(
 ) -> Tensor:
     """Largest over smallest singular value of each state's Jacobian, `[B]`, in [1, infinity].
 
-    Args, errors and accuracy are those of `jacobian_singular_values`.
+    Args, errors and accuracy are those of `jacobian_singular_values`. For the logits or probabilities
+    of a Categorical, which have one output too many, it is infinite up to rounding.
 
     Example:
         >>> policy = torch.nn.Linear(3, 2, bias=False)
@@ -64,7 +65,8 @@ def condition_number(
         [1.5]
     """
     values = jacobian_singular_values(policy, obs, output=output, chunk_size=chunk_size)
-    return values[:, 0] / values[:, -1]
+    zero = values[:, -1] == 0
+    return (values[:, 0] / values[:, -1].masked_fill(zero, 1.0)).masked_fill(zero, torch.inf)
 
 
 def mean_squared_singular_value(
@@ -82,7 +84,7 @@ def mean_squared_singular_value(
         [6.5]
     """
     parts = _jacobians(policy, obs, output, chunk_size)
-    return torch.cat([j.square().sum((1, 2)) / min(j.shape[1:]) for j in parts])
+    return torch.cat(list(map(_mean_square, parts)))
 
 
 def largest_singular_value(
@@ -120,10 +122,10 @@ def largest_singular_value(
     respond, at = response(policy, states, output), zero_delta(states)
     v = _normalize(_noise(at.shape, at, generator))
     with torch.no_grad():
-        _, pullback = vjp(respond, at)[:2]
+        _, product = pullback(policy, states, output)
         for _ in range(iterations):
             change = jvp(respond, (at,), (v,))[1]
-            v = _normalize(pullback(change)[0])
+            v = _normalize(product(_normalize(change)))  # sigma⁴ would leave the range of float32
     largest: Tensor = safe_norm(jvp(respond, (at,), (v,))[1])
     return largest
 
@@ -159,9 +161,9 @@ def squared_frobenius_norm(
     """
     _at_least_1("probes", probes)
     states = read_states(obs, output)
-    answer, pullback = vjp(response(policy, states, output), zero_delta(states))[:2]
+    answer, product = pullback(policy, states, output)
     w = _noise((probes, *answer.shape), answer, generator).sign()
-    products: Tensor = vmap(lambda row: pullback(row)[0])(w)
+    products: Tensor = vmap(product)(w)
     return products.square().sum(-1).mean(0)
 
 
@@ -174,14 +176,26 @@ def _jacobians(
     return jacobians(policy, states, output, chunk_size or states.batch[0])
 
 
+def _mean_square(jacobian: Tensor) -> Tensor:
+    return jacobian.square().sum((1, 2)) / min(jacobian.shape[1:])
+
+
 def _singular_values(jacobian: Tensor) -> Tensor:
+    # of a NaN, LAPACK makes zeros or an error
+    finite = jacobian.isfinite().flatten(1).all(1)[:, None]
+    values = _finite_singular_values(torch.where(finite[..., None], jacobian, 0.0))
+    return torch.where(finite, values, torch.nan)
+
+
+def _finite_singular_values(jacobian: Tensor) -> Tensor:
     short, long = sorted(jacobian.shape[1:])
     if jacobian.dtype == torch.float64 or long < 2 * short:
         values: Tensor = torch.linalg.svdvals(jacobian)
         return values
     wide = jacobian.double() if jacobian.shape[1] == short else jacobian.double().mT
     squares = torch.linalg.eigvalsh(wide @ wide.mT).flip(-1)
-    positive = squares > 0  # the slope of the root at 0 is infinite
+    # the slope of the root is infinite at 0, and of any size where rounding is all there is
+    positive = squares > short * torch.finfo(squares.dtype).eps * squares[:, :1]
     roots = torch.where(positive, squares, 1.0).sqrt()
     return torch.where(positive, roots, 0.0).to(jacobian.dtype)
 

@@ -17,9 +17,10 @@ from typing import Any
 import gymnasium as gym
 
 SUITES = Path(__file__).parent / "suites"
-REQUIRED = {"title", "reports", "seeds", "agents", "args", "algorithms", "environments"}
-KEYS = REQUIRED | {"note"}
-ALGORITHM_KEYS = {"name", "baseline", "args"}
+REQUIRED = {"title", "seeds", "agents", "args", "algorithms", "environments"}
+KEYS = REQUIRED | {"note", "figures", "sweeps"}
+ALGORITHM_KEYS = {"name", "baseline", "args", "environments"}
+SWEEP_KEYS = ALGORITHM_KEYS | {"parameter", "values"}
 
 
 class SuiteError(ValueError):
@@ -72,10 +73,13 @@ class Suite:
     name: str
     title: str
     note: str
-    reports: list[str]
     algorithms: list[str]
     environments: list[str]
     runs: list[RunSpec]
+    figures: dict[str, list[str]]
+    """figures of learning curves: a title, and the algorithms in it"""
+    sweeps: dict[str, dict[str, Any]]
+    """for each ablation, the algorithm that each value of its parameter makes"""
 
     @property
     def timesteps(self) -> int:
@@ -117,9 +121,7 @@ def load_suite(
         data = tomllib.loads(path.read_text())
     except tomllib.TOMLDecodeError as error:
         raise SuiteError(f"{path} is not valid TOML: {error}") from error
-    _known(data, KEYS, f"{path.name}: key")
-    for key in sorted(REQUIRED - set(data)):
-        raise SuiteError(f"{path.name} needs the key {key!r}")
+    _check_keys(data, REQUIRED, KEYS, path.name)
     for key, hint in (("seeds", tuple[int, ...]), ("agents", int), ("args", dict)):
         if not _fits(data[key], hint):
             raise SuiteError(f"{path.name}: {key} must be of type {hint}, got {data[key]!r}")
@@ -133,11 +135,16 @@ def load_suite(
         {} if total_timesteps is None else {"total_timesteps": total_timesteps}
     )
     runs = []
-    for algorithm in data["algorithms"]:
-        _known(algorithm, ALGORITHM_KEYS, f"{path.name}: key of an algorithm")
-        for key in sorted({"name", "baseline"} - set(algorithm)):
-            raise SuiteError(f"{path.name}: an algorithm needs the key {key!r}")
-        for environment, env_id in environments.items():
+    sweeps = _sweeps(data, path)
+    algorithms = [*data["algorithms"], *(a for made in sweeps.values() for a in made.values())]
+    for algorithm in algorithms:
+        _check_keys(algorithm, {"name", "baseline"}, ALGORITHM_KEYS, f"{path.name}: algorithm")
+        _known(dict.fromkeys(algorithm.get("environments", ())), set(data["environments"]),
+               f"{path.name}: {algorithm['name']}: environment")  # fmt: skip
+        for environment in algorithm.get("environments", data["environments"]):
+            if environment not in environments:
+                continue
+            env_id = environments[environment]
             args = {"env_id": env_id, **common, **algorithm.get("args", {})}
             where = f"{path.name}: {algorithm['name']} on {environment}"
             for seed in data["seeds"]:
@@ -157,15 +164,42 @@ def load_suite(
         raise SuiteError(f"{path.name} has no runs: it needs algorithms, environments and seeds")
     if len({run.run_id for run in runs}) < len(runs):
         raise SuiteError(f"{path.name}: names of algorithms and seeds must differ from each other")
+    for named in data.get("figures", {}).values():
+        _known(dict.fromkeys(named), {a["name"] for a in algorithms}, f"{path.name}: algorithm")
     return Suite(
         name=path.stem,
         title=data["title"],
         note=data.get("note", ""),
-        reports=data["reports"],
-        algorithms=[algorithm["name"] for algorithm in data["algorithms"]],
+        algorithms=[algorithm["name"] for algorithm in algorithms],
         environments=list(environments),
         runs=runs,
+        figures=data.get("figures", {}),
+        sweeps={k: {v: a["name"] for v, a in made.items()} for k, made in sweeps.items()},
     )
+
+
+def _sweeps(data: dict[str, Any], path: Path) -> dict[str, dict[Any, dict[str, Any]]]:
+    """For each sweep, the algorithm that each of its values makes."""
+    made = {}
+    for sweep in data.get("sweeps", []):
+        needed = {"name", "baseline", "parameter", "values"}
+        _check_keys(sweep, needed, SWEEP_KEYS, f"{path.name}: sweep")
+        common = {k: v for k, v in sweep.items() if k in ALGORITHM_KEYS}
+        made[sweep["name"]] = {
+            value: {
+                **common,
+                "name": f"{sweep['name']}={value}",
+                "args": {**sweep.get("args", {}), sweep["parameter"]: value},
+            }
+            for value in sweep["values"]
+        }
+    return made
+
+
+def _check_keys(given: dict[str, Any], needed: set[str], known: set[str], where: str) -> None:
+    _known(given, known, f"{where}: key")
+    for key in sorted(needed - set(given)):
+        raise SuiteError(f"{where} needs the key {key!r}")
 
 
 def check_args(baseline: str, args: dict[str, Any], where: str) -> None:
@@ -198,6 +232,8 @@ def _fits(value: Any, hint: Any) -> bool:
     origin = typing.get_origin(hint)
     if origin in (types.UnionType, typing.Union):
         return any(_fits(value, option) for option in typing.get_args(hint))
+    if origin is typing.Literal:
+        return value in typing.get_args(hint)
     if origin is tuple:  # TOML knows lists only
         return isinstance(value, list) and all(_fits(x, typing.get_args(hint)[0]) for x in value)
     if hint is float:

@@ -138,7 +138,7 @@ def count_rollout(num_steps: int = 5, **ends) -> Rollout:
     envs = gym.wrappers.vector.RecordEpisodeStatistics(envs)
     args = Args(env_id="Pendulum-v1", num_steps=num_steps, num_minibatches=1)
     learner = ppo_reg.Learner(Args(env_id="MountainCarContinuous-v0"))
-    learner.actor = ppo_reg.Actor((1, 8, 1), torch.Generator())
+    learner.actor = ppo_reg.Actor(args, 1, 1, torch.Generator())
     learner.critic = torch.nn.Linear(1, 1, bias=False)
     torch.nn.init.ones_(learner.critic.weight)
     next_obs, _ = envs.reset(seed=0)

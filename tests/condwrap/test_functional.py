@@ -301,3 +301,10 @@ def test_penalty_refuses_a_range(lambda_min, lambda_max):
     message = f"got lambda_min={lambda_min} and lambda_max={lambda_max}"
     with pytest.raises(ValueError, match=re.escape(message)):
         clamping_penalty(np.ones(2), lambda_min, lambda_max)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_broken_output_does_not_pass_for_a_well_conditioned_one(value):
+    output, other = torch.tensor([[value, 0.0]]), torch.zeros(1, 2)
+    quotient = conditioning_quotient(output, other, torch.ones(1, 2))
+    assert not torch.isfinite(quotient).any()
