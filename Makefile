@@ -11,7 +11,7 @@ help:  ## what each target does
 
 run: $(INSTALLED)  ## the main job: PPO with and without the regularizer on 8 tasks, then a table
 	$(BIN)/python -m harness run-all --suite smoke
-	@echo "Look at results/smoke/report/learning_curves.png and results/smoke/report/table1.md"
+	@echo "Look at results/smoke/report/report.html"
 
 test: $(INSTALLED)  ## the default tests, in minutes
 	$(BIN)/python -m pytest --numprocesses=auto --cov=condwrap --cov-fail-under=100

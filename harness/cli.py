@@ -16,7 +16,8 @@ from rich.table import Table
 
 from harness.launchers.local import Outcome, run_local
 from harness.progress import Progress, duration
-from harness.report import figures, table1
+from harness.report import table1
+from harness.report.page import write_report
 from harness.report.results import Results, load_results
 from harness.store import STATES, Store, StoreError
 from harness.suite import SuiteError, load_suite, suite_names
@@ -125,17 +126,15 @@ def report(suite: str = DEFAULT_SUITE, results_dir: Path = Path("results")) -> N
 
 
 def make_report(results: Results, store: Store) -> None:
-    """Print the table and write it, and the learning curves, to results/<suite>/report/."""
+    """Print the table and the verdicts, and write the whole report to results/<suite>/report/."""
     folder = store.report_path(results.suite.name)
-    cells = table1.make_cells(results)
+    cells, found = write_report(results, folder)
     console.print(table1.to_rich(results, cells))
     for note in table1.notes(results, cells):
         say(f"• {note}", markup=False)
-    (folder / "table1.md").write_text(table1.to_markdown(results, cells))
-    table1.to_frame(cells).to_csv(folder / "table1.csv", index=False)
-    algorithms = results.suite.algorithms
-    figures.learning_curves(results, algorithms, folder / "learning_curves.png")
-    say(f"Written: {folder}/table1.md, table1.csv, learning_curves.png")
+    for claim in found:
+        say(f"Claim ({claim.letter}): {claim.statement} [bold]{claim.verdict}[/]")
+    say(f"Written: {folder / 'report.html'}, with its tables and figures beside it.")
 
 
 def show_others(results: Results) -> None:

@@ -9,6 +9,8 @@ import pandas as pd
 from scipy import stats
 
 RESAMPLES = 10_000
+MIN_AGENTS = 10  # below, bootstrap intervals are too narrow to rest a verdict on
+TOO_FEW = "too few runs to tell"
 
 
 class Estimate(NamedTuple):
@@ -62,3 +64,60 @@ def interval_of_means(values: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np
     some = present.any(axis=1)
     low[some], high[some] = np.nanpercentile(means[some], (2.5, 97.5), axis=1)
     return low, high
+
+
+def rank_correlation(groups: list[np.ndarray], seed: int = 0) -> Estimate:
+    """Spearman's rank correlation of pairs, `[n, 2]` in each group, averaged over groups.
+
+    Groups, such as tasks, are weighted by their size; the interval resamples pairs within groups.
+    Groups of fewer than 3 pairs, or in which one side does not vary, tell nothing and are left out.
+    """
+    groups = [g for g in groups if len(g) > 2 and np.ptp(g[:, 0]) > 0 and np.ptp(g[:, 1]) > 0]
+    n = sum(map(len, groups))
+    if not groups:
+        return Estimate(np.nan, np.nan, np.nan, 0)
+    rng, total, resampled = np.random.default_rng(seed), 0.0, np.zeros(2000)
+    for group in groups:
+        weight = len(group) / n
+        total += weight * spearman(group[None])[0]
+        picks = rng.integers(len(group), size=(2000, len(group)))
+        resampled += weight * spearman(group[picks])
+    low, high = np.nanpercentile(resampled, (2.5, 97.5))
+    return Estimate(float(total), float(low), float(high), n)
+
+
+def spearman(pairs: np.ndarray) -> np.ndarray:
+    """Spearman's correlation of each set of pairs, `[sets, n, 2]`; NaN if a side is flat."""
+    ranks = stats.rankdata(pairs, axis=1)
+    ranks -= ranks.mean(axis=1, keepdims=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        products = (ranks[..., 0] * ranks[..., 1]).sum(1)
+        return products / np.sqrt((ranks**2).sum(1).prod(-1))
+
+
+def interquartile_mean(groups: list[np.ndarray], seed: int = 0) -> Estimate:
+    """Mean of the middle half of all values, resampled within groups (Agarwal et al., 2021)."""
+    groups = [g for g in groups if len(g)]
+    n = sum(map(len, groups))
+    if not groups:
+        return Estimate(np.nan, np.nan, np.nan, 0)
+    mean = float(stats.trim_mean(np.concatenate(groups), 0.25))
+    if min(map(len, groups)) < 2:
+        return Estimate(mean, np.nan, np.nan, n)
+    rng = np.random.default_rng(seed)
+    picks = [g[rng.integers(len(g), size=(2000, len(g)))] for g in groups]
+    means = stats.trim_mean(np.concatenate(picks, axis=1), 0.25, axis=1)
+    return Estimate(mean, *map(float, np.percentile(means, (2.5, 97.5))), n)
+
+
+def verdict(estimate: Estimate, sign: int) -> str:
+    """What an estimate says of the claim that its true value has this sign.
+
+    "supported" or "contradicted" where the whole 95% interval is on one side of 0, "not supported"
+    where it holds 0, and "too few runs to tell" below MIN_AGENTS values.
+    """
+    if estimate.n < MIN_AGENTS or np.isnan(estimate.low):
+        return TOO_FEW
+    if estimate.low <= 0 <= estimate.high:
+        return "not supported"
+    return "supported" if (estimate.low > 0) == (sign > 0) else "contradicted"

@@ -23,11 +23,16 @@ MEASURES = (("charts/episodic_return", "reward"), ("conditioning/psi", "psi"))
 
 
 def learning_curves(results: Results, algorithms: list[str], path: Path) -> None:
-    """Mean over agents with its 95% interval, for each task that has runs, as a PNG."""
+    """Mean over agents with its 95% interval, as a PNG.
+
+    A panel for each task that the suite plans for all of these algorithms and that has runs.
+    """
+    planned = {(run.environment, run.algorithm) for run in results.suite.runs}
     tasks = [
-        environment
-        for environment in results.suite.environments
-        if any(results.of(environment, algorithm) for algorithm in algorithms)
+        task
+        for task in results.suite.environments
+        if all((task, algorithm) in planned for algorithm in algorithms)
+        and any(results.of(task, algorithm) for algorithm in algorithms)
     ]
     columns = max(1, min(COLUMNS, len(tasks)))
     blocks = max(1, -(-len(tasks) // columns))

@@ -56,10 +56,11 @@ def paper_numbers() -> dict[str, Any]:
 def make_cells(results: Results) -> list[Cell]:
     """A cell for each environment and algorithm, from whatever has been run so far."""
     suite, paper = results.suite, paper_numbers()
+    algorithms = [a for a in suite.algorithms if a in paper] or suite.algorithms
     planned = Counter((run.environment, run.algorithm) for run in suite.runs)
     seeds = {run.run_id: run.args["seed"] for run in suite.runs}
     cells = []
-    for environment, algorithm in itertools.product(suite.environments, suite.algorithms):
+    for environment, algorithm in itertools.product(suite.environments, algorithms):
         if not planned[environment, algorithm]:
             continue
         found = results.of(environment, algorithm)
@@ -97,8 +98,9 @@ def notes(results: Results, cells: list[Cell]) -> list[str]:
         )
     if run:
         lines.append(
-            f"Agents in a cell: {_span(c.agents for c in run)}, over {_span(c.seeds for c in run)} "
-            f"seeds; the paper has {paper['agents']} for each of {paper['seeds']} seeds."
+            f"Agents in a cell: {_span(c.agents for c in run)}; "
+            f"seeds: {_span(c.seeds for c in run)}. "
+            f"The paper has {paper['agents']} agents for each of {paper['seeds']} seeds."
         )
     if any(c.agents > 1 for c in cells):
         lines.append("Brackets hold the 95% bootstrap interval of the mean over agents.")
@@ -136,7 +138,8 @@ def to_frame(cells: list[Cell]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _rows(suite: Suite, cells: list[Cell]) -> tuple[list[str], list[list[str]]]:
+def to_rows(suite: Suite, cells: list[Cell]) -> tuple[list[str], list[list[str]]]:
+    """The table as text: a header, and a row for each task."""
     algorithms = [a for a in suite.algorithms if any(c.algorithm == a for c in cells)]
     found = {(c.environment, c.algorithm): c for c in cells}
     header = ["task"]
@@ -155,7 +158,7 @@ def _rows(suite: Suite, cells: list[Cell]) -> tuple[list[str], list[list[str]]]:
 
 def to_markdown(results: Results, cells: list[Cell]) -> str:
     """The table and its notes, then how much each cell rests on."""
-    header, rows = _rows(results.suite, cells)
+    header, rows = to_rows(results.suite, cells)
     weights = [
         [c.environment, c.algorithm, f"{c.agents} of {c.planned}", str(c.seeds), f"{c.steps:,}",
          str(c.updates)] for c in cells
@@ -181,11 +184,13 @@ def _markdown(header: list[str], rows: list[list[str]]) -> str:
 
 
 def to_rich(results: Results, cells: list[Cell]) -> Table:
-    header, rows = _rows(results.suite, cells)
-    table = Table(title=f"{results.suite.name}: {paper_numbers()['metric']}")
-    for name in header:
-        justify, style = ("left", "") if name == "task" else ("right", "dim" * ("paper" in name))
-        table.add_column(name, justify=justify, style=style)  # type: ignore[arg-type]
-    for row in rows:
-        table.add_row(*row)
+    """The table for a terminal: the paper's number below ours."""
+    header, rows = to_rows(results.suite, cells)
+    table = Table(title=f"{results.suite.name}: {paper_numbers()['metric']}", show_lines=True)
+    table.add_column(header[0])
+    for name in header[1::2]:
+        table.add_column(name, justify="right")
+    for task, *texts in rows:
+        pairs = zip(texts[::2], texts[1::2], strict=True)
+        table.add_row(task, *(f"{ours}\n[dim]paper {paper or '–'}[/]" for ours, paper in pairs))
     return table

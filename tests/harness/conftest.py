@@ -13,7 +13,6 @@ from harness.suite import RunSpec, Suite, load_suite
 
 TINY = """
 title = "Tiny"
-reports = ["table1"]
 seeds = [1, 2]
 agents = 2
 
