@@ -55,6 +55,7 @@ def findings(claim: Claim, path: Path) -> None:
             axis.annotate(f" n={n}", (1, y), xycoords=("axes fraction", "data"), fontsize=7,
                           va="center", color="gray")  # fmt: skip
         axis.axvline(0.5 if "probability" in about else 0, color="black", linewidth=0.8)
+        axis.locator_params(axis="x", nbins=6)
         axis.set_yticks(range(len(found)), [f.task for f in reversed(found)])
         axis.set_ylim(-0.6, len(found) - 0.4)
         axis.set_title(about, fontsize=10)
