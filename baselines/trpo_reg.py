@@ -33,7 +33,7 @@ from gymnasium.wrappers.utils import RunningMeanStd
 from gymnasium.wrappers.vector import NormalizeReward, RecordEpisodeStatistics
 from torch import Tensor, nn
 from torch.distributions import Independent, Normal, kl_divergence
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
+from torch.nn.utils import parameters_to_vector
 from torch.utils.tensorboard import SummaryWriter
 
 from condwrap import ConditioningRegularizer  # condwrap
@@ -342,22 +342,24 @@ def conjugate_gradient(
 ) -> tuple[Tensor, float]:
     """Solve A x = b for a symmetric positive definite A, given by its products with vectors.
 
-    Hestenes and Stiefel (1952). Ends after `steps`, once ‖b - A x‖² < tolerance, or where the
-    curvature pᵀ A p is not above 0, with the x found so far. Returns x and ‖b - A x‖ / ‖b‖.
+    Hestenes and Stiefel (1952). Ends after `steps`, once ‖b - A x‖² <= tolerance · ‖b‖², or where
+    the curvature pᵀ A p is not above 0, with the x found so far. Returns x and ‖b - A x‖ / ‖b‖.
     """
     x, residual, direction = torch.zeros_like(b), b.clone(), b.clone()
     squared = start = residual @ residual
     for _ in range(steps):
+        if squared <= tolerance * start:
+            break
         image = product(direction)
         curvature = direction @ image
-        if squared < tolerance or not curvature > 0:  # not above 0: NaN too
+        if not curvature > 0:  # NaN too
             break
         size = squared / curvature
         x += size * direction
         residual -= size * image
         squared, before = residual @ residual, squared
         direction = residual + (squared / before) * direction
-    return x, (squared / start).sqrt().item()
+    return x, (squared / start).sqrt().item() if start else 0.0
 
 
 def fisher_product(kl: Tensor, parameters: list[nn.Parameter], damping: float) -> Any:
@@ -368,6 +370,15 @@ def fisher_product(kl: Tensor, parameters: list[nn.Parameter], damping: float) -
 
 def flat_grad(value: Tensor, parameters: list[nn.Parameter], **kwargs: bool) -> Tensor:
     return torch.cat([g.flatten() for g in torch.autograd.grad(value, parameters, **kwargs)])
+
+
+def set_parameters(parameters: list[nn.Parameter], vector: Tensor) -> None:
+    """Copy the vector in. Views into it (`vector_to_parameters`) round otherwise than what a
+    checkpoint loads, since they are aligned otherwise, and a resumed run would not be the same.
+    """
+    parts = vector.split([p.numel() for p in parameters])
+    for parameter, part in zip(parameters, parts, strict=True):
+        parameter.data.copy_(part.view_as(parameter))
 
 
 def natural_step(
@@ -384,25 +395,28 @@ def natural_step(
     old = parameters_to_vector(parameters).detach().clone()
     before = objective()
     gradient = flat_grad(before, parameters)
+    names = ("kl", "step_fraction", "cg_residual", "accepted")
+    logs = dict.fromkeys((*names, "expected_improvement", "actual_improvement"), 0.0)
+    if not gradient.isfinite().all() or not gradient.any():
+        print(f"step rejected: the gradient is {'0' if not gradient.any() else 'not finite'}")
+        return logs
     product = fisher_product(mean_kl(), parameters, args.cg_damping)
-    direction, residual = conjugate_gradient(product, gradient, args.cg_steps)
+    direction, logs["cg_residual"] = conjugate_gradient(product, gradient, args.cg_steps)
     curvature = direction @ product(direction)
     full_step = (2 * args.target_kl / curvature).sqrt() * direction
-    logs = {"kl": 0.0, "step_fraction": 0.0, "cg_residual": residual, "accepted": 0.0}
-    logs |= {"expected_improvement": (gradient @ full_step).item(), "actual_improvement": 0.0}
-    if not torch.isfinite(full_step).all():
-        reason = "the gradient is not finite" if curvature != curvature else "no positive curvature"
-        print(f"step rejected: {reason}")
+    if not full_step.isfinite().all():
+        print("step rejected: no positive curvature")
         return logs
+    logs["expected_improvement"] = (gradient @ full_step).item()
     for i in range(args.line_search_steps):
         fraction = args.line_search_shrink**i
-        vector_to_parameters(old + fraction * full_step, parameters)
+        set_parameters(parameters, old + fraction * full_step)
         with torch.no_grad():
             gain, kl = (objective() - before).item(), mean_kl().item()
-        if kl <= args.target_kl and gain > 0:
+        if kl <= args.target_kl and 0 < gain < math.inf:
             return logs | {"kl": kl, "step_fraction": fraction, "accepted": 1.0,
                            "actual_improvement": gain}  # fmt: skip
-    vector_to_parameters(old, parameters)
+    set_parameters(parameters, old)
     print("step rejected: no fraction of it improves the objective within the KL bound")
     return logs
 

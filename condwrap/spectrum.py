@@ -55,8 +55,8 @@ def condition_number(
 ) -> Tensor:
     """Largest over smallest singular value of each state's Jacobian, `[B]`, in [1, infinity].
 
-    Args, errors and accuracy are those of `jacobian_singular_values`. For the logits or probabilities
-    of a Categorical, which have one output too many, it is infinite up to rounding.
+    Args, errors and accuracy are those of `jacobian_singular_values`. For the logits or
+    probabilities of a Categorical, which have one output too many, it is infinite up to rounding.
 
     Example:
         >>> policy = torch.nn.Linear(3, 2, bias=False)

@@ -1,0 +1,112 @@
+"""What the tests of the baselines share: short runs, what they left behind, and the program."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+
+from baselines import ppo_reg, trpo_reg
+
+BASELINES = (ppo_reg, trpo_reg)
+SMALL = {
+    ppo_reg: {"num_steps": 64, "num_minibatches": 4, "update_epochs": 2, "vf_epochs": 2},
+    trpo_reg: {"num_steps": 64, "num_minibatches": 4, "vf_epochs": 2},
+}
+FLAGS = ["--env-id=Pendulum-v1", "--num-steps=64", "--num-minibatches=4", "--checkpoint-interval=2"]
+
+
+def name(baseline: ModuleType) -> str:
+    return Path(baseline.__file__).stem
+
+
+def pendulum(baseline: ModuleType, path: Path, **changes):
+    """Arguments of a run of 5 short updates."""
+    settings = {"env_id": "Pendulum-v1", "total_timesteps": 320, "run_dir": path}
+    return baseline.Args(**{**settings, **SMALL[baseline], **changes})
+
+
+def read_metrics(path: Path) -> list[dict[str, str]]:
+    with open(path / "metrics.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def without_speed(path: Path) -> list[dict[str, str]]:
+    return [{k: v for k, v in row.items() if k != "charts/SPS"} for row in read_metrics(path)]
+
+
+def flat(module: torch.nn.Module) -> torch.Tensor:
+    return torch.cat([p.detach().flatten() for p in module.parameters()])
+
+
+def weights(learner) -> torch.Tensor:
+    return torch.cat([flat(learner.actor), flat(learner.critic)])
+
+
+def load_module(path: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+def interrupted(baseline: ModuleType, args, monkeypatch, at_update: int) -> None:
+    """Train until Ctrl-C comes in the middle of an update."""
+    update = baseline.update
+
+    def stop(args, learner, data):
+        if learner.update == at_update:
+            raise KeyboardInterrupt
+        return update(args, learner, data)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(baseline, "update", stop)
+        with pytest.raises(KeyboardInterrupt):
+            baseline.train(args)
+
+
+class Program:
+    """A copy of the file, run alone in a folder, its output in a log."""
+
+    def __init__(self, baseline: ModuleType, folder: Path, *flags: str, **kwargs) -> None:
+        copy = shutil.copy(baseline.__file__, folder)
+        environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+        self.log = folder / "log.txt"
+        with open(self.log, "w") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, copy, *FLAGS, *flags],
+                cwd=folder, env=environment, stdout=log, stderr=log, **kwargs,
+            )  # fmt: skip
+
+    def wait(self) -> str:
+        self.process.wait()
+        return self.log.read_text()
+
+    def kill_after_checkpoint(self, run: Path, kill: int) -> str:
+        while not (run / "checkpoint.pt").exists():
+            assert self.process.poll() is None, self.log.read_text()
+            time.sleep(0.02)
+        self.process.send_signal(kill)
+        return self.wait()
+
+
+def check_refusal(baseline: ModuleType, flags, message, monkeypatch, capsys, folder: Path) -> None:
+    """The program ends with an error that holds the message."""
+    monkeypatch.setattr(sys, "argv", [f"{name(baseline)}.py", *flags])
+    monkeypatch.chdir(folder)
+    with pytest.raises(SystemExit) as stopped:
+        baseline.main()
+    captured = capsys.readouterr()
+    said = " ".join(f"{captured.out} {captured.err} {stopped.value}".replace("│", " ").split())
+    assert message in said
+    assert stopped.value.code != 0
