@@ -70,7 +70,8 @@ def rank_correlation(groups: list[np.ndarray], seed: int = 0) -> Estimate:
     """Spearman's rank correlation of pairs, `[n, 2]` in each group, averaged over groups.
 
     Groups, such as tasks, are weighted by their size; the interval resamples pairs within groups.
-    Groups of fewer than 3 pairs, or in which one side does not vary, tell nothing and are left out.
+    Groups of fewer than 3 pairs, or in which one side does not vary, tell nothing and are left out;
+    a resample in which one side does not vary counts as no correlation.
     """
     groups = [g for g in groups if len(g) > 2 and np.ptp(g[:, 0]) > 0 and np.ptp(g[:, 1]) > 0]
     n = sum(map(len, groups))
@@ -81,8 +82,8 @@ def rank_correlation(groups: list[np.ndarray], seed: int = 0) -> Estimate:
         weight = len(group) / n
         total += weight * spearman(group[None])[0]
         picks = rng.integers(len(group), size=(2000, len(group)))
-        resampled += weight * spearman(group[picks])
-    low, high = np.nanpercentile(resampled, (2.5, 97.5))
+        resampled += weight * np.nan_to_num(spearman(group[picks]))
+    low, high = np.percentile(resampled, (2.5, 97.5))
     return Estimate(float(total), float(low), float(high), n)
 
 

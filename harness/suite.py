@@ -164,7 +164,9 @@ def load_suite(
         raise SuiteError(f"{path.name} has no runs: it needs algorithms, environments and seeds")
     if len({run.run_id for run in runs}) < len(runs):
         raise SuiteError(f"{path.name}: names of algorithms and seeds must differ from each other")
-    for named in data.get("figures", {}).values():
+    for title, named in data.get("figures", {}).items():
+        if not _fits(named, tuple[str, ...]):
+            raise SuiteError(f"{path.name}: figure {title!r} must list algorithms, got {named!r}")
         _known(dict.fromkeys(named), {a["name"] for a in algorithms}, f"{path.name}: algorithm")
     return Suite(
         name=path.stem,
@@ -184,6 +186,11 @@ def _sweeps(data: dict[str, Any], path: Path) -> dict[str, dict[Any, dict[str, A
     for sweep in data.get("sweeps", []):
         needed = {"name", "baseline", "parameter", "values"}
         _check_keys(sweep, needed, SWEEP_KEYS, f"{path.name}: sweep")
+        where, values = f"{path.name}: sweep {sweep['name']}", sweep["values"]
+        if not isinstance(values, list) or any(isinstance(value, list | dict) for value in values):
+            raise SuiteError(f"{where}: values must be a list of plain values, got {values!r}")
+        if sweep["name"] in made or len(set(values)) < len(values):
+            raise SuiteError(f"{where}: names of sweeps and their values must differ")
         common = {k: v for k, v in sweep.items() if k in ALGORITHM_KEYS}
         made[sweep["name"]] = {
             value: {
@@ -191,7 +198,7 @@ def _sweeps(data: dict[str, Any], path: Path) -> dict[str, dict[Any, dict[str, A
                 "name": f"{sweep['name']}={value}",
                 "args": {**sweep.get("args", {}), sweep["parameter"]: value},
             }
-            for value in sweep["values"]
+            for value in values
         }
     return made
 

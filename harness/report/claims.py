@@ -13,6 +13,7 @@ import pandas as pd
 
 from harness.report.results import Results
 from harness.statistics import (
+    MIN_AGENTS,
     TOO_FEW,
     Estimate,
     estimate_mean,
@@ -74,6 +75,7 @@ def agent_table(results: Results) -> pd.DataFrame:
                 "plain": run.args.get("coefficient") == 0 and not run.args.get("perturb_obs"),
                 "seed": run.args["seed"],
                 "agent": run.args["agent"],
+                "done": run.run_id in results.done,
                 "updates": len(metrics),
                 "reward": final_score(metrics),
                 "psi": psi.tail(100).mean(),
@@ -81,9 +83,9 @@ def agent_table(results: Results) -> pd.DataFrame:
                 "together": spearman(pairs[None])[0] if len(pairs) > 2 else np.nan,
             }
         )
-    columns = ["environment", "algorithm", "plain", "seed", "agent", "updates"]
+    columns = ["environment", "algorithm", "plain", "seed", "agent", "done", "updates"]
     columns += ["reward", "psi", "early_psi", "together"]
-    return pd.DataFrame(rows, columns=columns)
+    return pd.DataFrame(rows, columns=columns).astype({"plain": bool, "done": bool})
 
 
 def conditioning_claim(agents: pd.DataFrame) -> Claim:
@@ -107,12 +109,18 @@ def conditioning_claim(agents: pd.DataFrame) -> Claim:
     return Claim("a", STATEMENTS["a"], overall, findings)
 
 
-def comparison_claim(agents: pd.DataFrame, letter: str) -> Claim:
-    """Claims (b) and (c): paired differences, second minus first, same seed, agent and noise."""
+def comparison_claim(agents: pd.DataFrame, letter: str, planned: set[tuple[str, str]]) -> Claim:
+    """Claims (b) and (c): paired differences, second minus first, same seed, agent and noise.
+
+    A task that `planned`, (task, algorithm), has and `agents` has not leaves the claim open.
+    """
     findings, verdicts = [], []
     for first, second in PAIRS[letter]:
         about = f"{second} - {first}"
         differences = paired_differences(agents, first, second)
+        tasks = {task for task, name in planned if name == first and (task, second) in planned}
+        if tasks - set(differences):
+            verdicts.append(TOO_FEW)
         if not differences:
             continue
         each = [
@@ -120,14 +128,15 @@ def comparison_claim(agents: pd.DataFrame, letter: str) -> Claim:
             for task, d in differences.items()
         ]
         standard = [d["standard"].to_numpy() for d in differences.values()]
+        middle, least = interquartile_mean(standard), min(map(len, standard))
         wins = np.concatenate(
             [np.heaviside(d["raw"].to_numpy(), 0.5) for d in differences.values()]
         )
         probability = estimate_mean(wins)
         findings += [
             *each,
-            _finding(f"{about}: in standard deviations, interquartile mean", "all",
-                     interquartile_mean(standard), +1),
+            Finding(f"{about}: in standard deviations, interquartile mean", "all", middle,
+                    verdict(middle, +1) if least >= MIN_AGENTS else TOO_FEW),
             Finding(f"{about}: probability of improvement", "all", probability,
                     verdict(_shift(probability, -0.5), +1)),
         ]  # fmt: skip
@@ -174,9 +183,12 @@ def agreed(verdicts: list[str]) -> str:
 
 
 def make_claims(results: Results) -> list[Claim]:
-    """Claims (a), (b) and (c), as far as the suite's runs speak of them."""
+    """Claims (a), (b) and (c), as far as the suite's complete runs speak of them."""
     agents = agent_table(results)
-    claims = [conditioning_claim(agents), *(comparison_claim(agents, c) for c in "bc")]
+    agents = agents[agents["done"]]  # one that still learns is no match for one that is done
+    planned = {(run.environment, run.algorithm) for run in results.suite.runs}
+    compared = (comparison_claim(agents, letter, planned) for letter in "bc")
+    claims = [conditioning_claim(agents), *compared]
     if (agents["updates"] < MIN_UPDATES).any():
         claims = [_without_verdict(claim) for claim in claims]
     return [claim for claim in claims if claim.findings]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import matplotlib as mpl
@@ -50,7 +51,7 @@ def learning_curves(results: Results, algorithms: list[str], path: Path) -> None
             axis = axes[2 * block + j, column]
             axis.set_visible(True)
             tidy(axis)
-            for algorithm, color in zip(algorithms, COLORS, strict=False):
+            for algorithm, color in zip(algorithms, itertools.cycle(COLORS), strict=False):
                 _draw(axis, results.curves(task, algorithm, measure), algorithm, color)
             axis.set_ylabel(label if column == 0 else "")
             axis.set_title(task if j == 0 else "", fontsize=11)

@@ -18,6 +18,8 @@ class Results:
     metrics: dict[str, pd.DataFrame]
     changed: list[str]
     """ids of runs that were made by another configuration: left out"""
+    done: list[str]
+    """ids of runs that are complete"""
 
     def of(self, environment: str, algorithm: str) -> dict[str, pd.DataFrame]:
         """The metrics of one algorithm's agents on one environment, by run id."""
@@ -36,10 +38,11 @@ class Results:
 
 def load_results(suite: Suite, store: Store) -> Results:
     """Read what there is; runs may be unfinished, or still be running."""
-    metrics, changed = {}, []
+    metrics, changed, done = {}, [], []
     for run in suite.runs:
         if store.state(run) == "changed":
             changed.append(run.run_id)
         elif (found := store.metrics(run)) is not None:
             metrics[run.run_id] = found
-    return Results(suite, metrics, changed)
+            done += [run.run_id] if store.is_done(run) else []
+    return Results(suite, metrics, changed, done)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ def psi_and_reward(agents: pd.DataFrame, path: Path) -> None:
     algorithms = list(agents["algorithm"].unique())
     figure, axes = _panels(list(agents["environment"].unique()))
     for task, axis in axes.items():
-        for algorithm, color in zip(algorithms, COLORS * 2, strict=False):
+        for algorithm, color in zip(algorithms, itertools.cycle(COLORS), strict=False):
             of = agents[(agents["environment"] == task) & (agents["algorithm"] == algorithm)]
             if len(of):
                 axis.scatter(of["psi"], of["reward"], color=color, s=16, alpha=0.7, label=algorithm)
@@ -119,7 +120,8 @@ def _sweep_panel(axis: Axes, agents: pd.DataFrame, measure: str, values: dict[An
             axis.plot(x, mean, "o", color=COLORS[0])
             axis.plot([x, x], [low, high], color=COLORS[0], linewidth=2)
     plain = estimate_mean(agents.loc[agents["algorithm"] == "PPO", measure].dropna().to_numpy())
-    axis.axhline(plain.mean, color="gray", linestyle="--", linewidth=0.8, label="PPO")
+    if plain.n:
+        axis.axhline(plain.mean, color="gray", linestyle="--", linewidth=0.8, label="PPO")
     axis.set_xticks(range(len(values)), [str(value) for value in values])
 
 

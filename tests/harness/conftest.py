@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -56,8 +57,25 @@ def store(tmp_path) -> Store:
     return Store(tmp_path / "results")
 
 
-def write_run(store: Store, spec: RunSpec, returns: list[float], psi: float = 0.5) -> None:
-    """What a finished run leaves behind, with these mean returns of its updates."""
+def write_run(
+    store: Store,
+    spec: RunSpec,
+    returns: Sequence[float],
+    psi: float | Sequence[float] = 0.5,
+    *,
+    columns: dict[str, Sequence[float]] | None = None,
+    done: bool = True,
+) -> None:
+    """What a run leaves behind, with these mean returns and psi of its updates.
+
+    Args:
+        store: Where it goes.
+        spec: The run.
+        returns: Mean return of each update; NaN where no episode ended.
+        psi: The same for psi, or one value for all.
+        columns: More columns of its metrics.
+        done: Whether it came to its end.
+    """
     store.start(spec, ["true"])
     steps = np.arange(1, len(returns) + 1) * 100
     metrics = pd.DataFrame(
@@ -66,8 +84,10 @@ def write_run(store: Store, spec: RunSpec, returns: list[float], psi: float = 0.
             "charts/episodic_return": returns,
             "charts/SPS": 1000.0,
             "conditioning/psi": psi,
+            **(columns or {}),
         }
     )
     metrics.to_csv(store.path(spec, "metrics.csv"), index=False)
     store.path(spec, "checkpoint.pt").write_bytes(b"weights")
-    store.finish(spec, returncode=0, seconds=1.0)
+    if done:
+        store.finish(spec, returncode=0, seconds=1.0)

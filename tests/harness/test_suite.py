@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
+from collections import Counter
+
 import pytest
 import tyro
 
-from baselines.ppo_reg import Args
+from harness.statistics import MIN_AGENTS
 from harness.suite import SuiteError, load_suite, suite_names
 
 
@@ -25,8 +28,11 @@ def test_the_hash_is_of_the_configuration(suite, suite_file):
 @pytest.mark.parametrize("name", suite_names())
 def test_flags_say_to_the_baseline_what_the_suite_says(name):
     for run in load_suite(name).runs[::7]:
-        args = tyro.cli(Args, args=run.flags)
-        expected = Args(**{k: tuple(v) if isinstance(v, list) else v for k, v in run.args.items()})
+        args_of = importlib.import_module(f"baselines.{run.baseline}").Args
+        args = tyro.cli(args_of, args=run.flags)
+        expected = args_of(
+            **{k: tuple(v) if isinstance(v, list) else v for k, v in run.args.items()}
+        )
         assert args == expected
 
 
@@ -36,7 +42,8 @@ def test_flags_of_booleans_and_lists(suite_file):
         "num_steps = 100\nnorm_obs = false\nanneal_lr = true\nhidden_sizes = [8, 4]",
     )
     suite_file.write_text(text)
-    args = tyro.cli(Args, args=load_suite(str(suite_file)).runs[0].flags)
+    run = load_suite(str(suite_file)).runs[0]
+    args = tyro.cli(importlib.import_module(f"baselines.{run.baseline}").Args, args=run.flags)
     assert (args.norm_obs, args.anneal_lr, args.hidden_sizes) == (False, True, (8, 4))
 
 
@@ -95,10 +102,16 @@ def test_table1_is_the_papers_plan():
         (
             "args = { coefficient",
             "arg = { coefficient",
-            "key of an algorithm 'arg' is unknown: args?",
+            "algorithm: key 'arg' is unknown: args?",
         ),
-        ('name = "PPO reg"\n', "", "an algorithm needs the key 'name'"),
+        ('name = "PPO reg"\n', "", "algorithm needs the key 'name'"),
         ('name = "PPO reg"', 'name = "PPO"', "must differ"),
+        (
+            "num_steps = 100",
+            'num_steps = 100\nactivation = "gelu"',
+            "activation must be .*tanh.*relu.*got 'gelu'",
+        ),
+        ("coefficient = 0.0", "coefficient = 0.0, cg_steps = 5", "argument 'cg_steps' is unknown"),
     ],
 )
 def test_a_bad_suite_is_refused_and_the_reason_told(suite_file, old, new, message):
@@ -115,3 +128,174 @@ def test_unknown_names_are_refused(suite_file):
         load_suite("tabel1.toml")
     with pytest.raises(SuiteError, match=r"environment 'Hoper' is unknown: Hopper\?"):
         load_suite(str(suite_file), env=("Hoper",))
+
+
+SWEEP = """
+[[sweeps]]
+name = "size of delta"
+baseline = "ppo_reg"
+parameter = "radius"
+values = [0.1, 2]
+args = { coefficient = 0.01 }
+environments = ["Reacher"]
+
+[environments]
+"""
+FIGURES = """
+[figures]
+"Both" = ["PPO", "PPO reg"]
+
+[environments]
+"""
+
+
+def added(suite_file, part: str) -> str:
+    """The name of the suite, with a part more."""
+    text = suite_file.read_text()
+    assert text.count("[environments]\n") == 1
+    suite_file.write_text(text.replace("[environments]\n", part))
+    return str(suite_file)
+
+
+def test_a_sweep_is_an_algorithm_for_each_value(suite_file):
+    suite = load_suite(added(suite_file, SWEEP))
+    names = ["size of delta=0.1", "size of delta=2"]
+    assert suite.algorithms == ["PPO", "PPO reg", *names]
+    assert suite.sweeps == {"size of delta": dict(zip([0.1, 2], names, strict=True))}
+    runs = [run for run in suite.runs if run.algorithm in names]
+    assert len(runs) == 2 * 2 * 2  # values, seeds, agents
+    assert {run.environment for run in runs} == {"Reacher"}
+    assert [run.args["radius"] for run in runs] == [0.1] * 4 + [2] * 4
+    assert {run.args["coefficient"] for run in runs} == {0.01}
+    assert runs[0].run_id == "size-of-delta-0-1__Reacher__s1__a0"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"radius"', '"raduis"', "argument 'raduis' is unknown: radius?"),
+        ("values = [0.1, 2]", "values = [0.1, -2]", "size of delta=-2 on Reacher: radius must be"),
+        ("values = [0.1, 2]", "", "sweep needs the key 'values'"),
+        ("values = [0.1, 2]", "values = [0.1, 0.1]", "values must differ"),
+        ("values = [0.1, 2]", "values = [2, 2.0]", "values must differ"),
+        ("values = [0.1, 2]", "values = 0.1", r"values must be a list of plain values, got 0\.1"),
+        ("values = [0.1, 2]", "values = [[1], [2]]", "values must be a list of plain values"),
+        ("values = [0.1, 2]", "vlaues = [0.1, 2]", "key 'vlaues' is unknown: values?"),
+        ('["Reacher"]', '["Raecher"]', "environment 'Raecher' is unknown: Reacher?"),
+    ],
+)
+def test_a_bad_sweep_is_refused_and_the_reason_told(suite_file, old, new, message):
+    assert old in SWEEP
+    with pytest.raises(SuiteError, match=message):
+        load_suite(added(suite_file, SWEEP.replace(old, new)))
+
+
+def test_a_sweep_does_not_displace_another_of_its_name(suite_file):
+    two = SWEEP.replace("[environments]\n", SWEEP.replace("[0.1, 2]", "[3]"))
+    with pytest.raises(SuiteError, match=r"names of sweeps .* must differ"):
+        load_suite(added(suite_file, two))
+
+
+def test_an_algorithm_runs_on_its_own_environments_only(suite_file):
+    text = suite_file.read_text().replace(
+        'name = "PPO reg"\n', 'name = "PPO reg"\nenvironments = ["Reacher"]\n'
+    )
+    suite_file.write_text(text)
+    runs = load_suite(str(suite_file)).runs
+    assert Counter((run.algorithm, run.environment) for run in runs) == {
+        ("PPO", "Hopper"): 4,
+        ("PPO", "Reacher"): 4,
+        ("PPO reg", "Reacher"): 4,
+    }
+    hopper = load_suite(str(suite_file), env=("Hopper",))
+    assert {run.algorithm for run in hopper.runs} == {"PPO"}
+
+
+def test_figures_name_the_algorithms_in_them(suite_file):
+    assert load_suite(str(suite_file)).figures == {}
+    assert load_suite(added(suite_file, FIGURES)).figures == {"Both": ["PPO", "PPO reg"]}
+
+
+@pytest.mark.parametrize(
+    ("named", "message"),
+    [
+        ('["PPO", "PPO rag"]', "algorithm 'PPO rag' is unknown: PPO reg?"),
+        ('"PPO"', "figure 'Both' must list algorithms, got 'PPO'"),
+        ("3", "figure 'Both' must list algorithms, got 3"),
+    ],
+)
+def test_a_bad_figure_is_refused_and_the_reason_told(suite_file, named, message):
+    with pytest.raises(SuiteError, match=message):
+        load_suite(added(suite_file, FIGURES.replace('["PPO", "PPO reg"]', named)))
+
+
+@pytest.mark.parametrize("name", suite_names())
+def test_every_suite_that_is_shipped_loads(name):
+    suite = load_suite(name)
+    assert suite.name == name
+    assert {run.environment for run in suite.runs} == set(suite.environments)
+    assert {run.algorithm for run in suite.runs} == set(suite.algorithms)
+
+
+def test_the_shipped_suites_are_the_five_of_the_study():
+    assert suite_names() == ["ablation", "figure1", "smoke", "strong", "table1"]
+
+
+@pytest.mark.parametrize("name", ["table1", "strong"])
+def test_a_suite_that_compares_has_the_agents_that_a_verdict_needs(name):
+    runs = Counter((run.environment, run.algorithm) for run in load_suite(name).runs)
+    assert min(runs.values()) >= MIN_AGENTS
+
+
+@pytest.mark.parametrize("name", ["smoke", "strong", "table1"])
+def test_the_four_algorithms_of_the_paper_differ_by_baseline_and_coefficient(name):
+    runs = {run.algorithm: run for run in load_suite(name).runs}
+    for plain, regularized in (("PPO", "PPO reg"), ("TRPO", "TRPO reg")):
+        assert runs[plain].baseline == runs[regularized].baseline == f"{plain.lower()}_reg"
+        without = {k: v for k, v in runs[plain].args.items() if k != "coefficient"}
+        assert without == runs[regularized].args
+        assert runs[plain].args["coefficient"] == 0
+
+
+def test_figure1_is_four_settings_of_plain_ppo_on_four_tasks():
+    suite = load_suite("figure1")
+    assert suite.environments == ["Humanoid", "Hopper", "Ant", "Reacher"]
+    assert len(suite.algorithms) == 4
+    assert {run.baseline for run in suite.runs} == {"ppo_reg"}
+    assert {run.args["coefficient"] for run in suite.runs} == {0}
+    assert list(suite.figures.values()) == [suite.algorithms]
+    assert "ours" in next(iter(suite.figures))  # the worse settings are not the paper's
+
+
+def test_smoke_holds_trpo_and_the_settings_of_figure_1():
+    smoke, figure1 = load_suite("smoke"), load_suite("figure1")
+    assert {"TRPO", "TRPO reg"} <= set(smoke.algorithms)
+    assert len(smoke.environments) == 8
+
+    def settings_of(suite):
+        changed = ("gae_lambda", "gamma", "vf_coef", "vf_learning_rate", "vf_epochs", "coefficient")
+        return {
+            (run.algorithm, run.environment): {k: v for k, v in run.args.items() if k in changed}
+            for run in suite.runs
+            if run.algorithm in figure1.algorithms and run.environment in figure1.environments
+        }
+
+    assert settings_of(smoke) == settings_of(figure1)
+    assert smoke.figures.items() >= figure1.figures.items()
+
+
+def test_the_ablation_sweeps_every_part_of_the_penalty():
+    suite = load_suite("ablation")
+    swept = {
+        name
+        for made in suite.sweeps.values()
+        for algorithm in made.values()
+        for run in suite.runs
+        if run.algorithm == algorithm
+        for name in run.args
+    }
+    assert {"coefficient", "lambda_min", "lambda_max", "radius", "perturbation"} <= swept
+    assert list(suite.sweeps["coefficient"]) == [1e-4, 1e-3, 1e-2, 1e-1, 1.0]
+    for run in suite.runs:
+        if run.algorithm in suite.sweeps["noise augmentation"].values():
+            assert (run.args["coefficient"], run.args["perturb_obs"]) == (0.0, True)

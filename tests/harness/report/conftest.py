@@ -1,0 +1,85 @@
+"""Results of studies that never ran: curves with known statistics, as a store holds them."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from harness.report.claims import MIN_UPDATES
+from harness.report.results import Results, load_results
+from harness.store import Store
+from harness.suite import load_suite
+from tests.harness.conftest import write_run
+
+ARGS = {
+    "PPO": 'baseline = "ppo_reg"\nargs = { coefficient = 0.0 }',
+    "PPO reg": 'baseline = "ppo_reg"',
+    "TRPO": 'baseline = "trpo_reg"\nargs = { coefficient = 0.0 }',
+    "TRPO reg": 'baseline = "trpo_reg"',
+    "PPO setting 2": 'baseline = "ppo_reg"\nargs = { coefficient = 0.0, gamma = 0.9 }',
+    "PPO noise": 'baseline = "ppo_reg"\nargs = { coefficient = 0.0, perturb_obs = true }',
+}
+COMMON = """
+title = "Synthetic"
+seeds = [1, 2]
+agents = {agents}
+
+[args]
+total_timesteps = 200
+num_steps = 100
+num_minibatches = 2
+"""
+Curve = float | Sequence[float] | None
+
+
+def make_study(
+    folder: Path,
+    reward: Callable[[str, str, int], Curve],
+    psi: Callable[[str, str, int], Curve] = lambda *_: 0.5,
+    *,
+    algorithms: Sequence[str] = ("PPO", "PPO reg"),
+    tasks: Sequence[str] = ("Hopper",),
+    agents: int = 10,
+    updates: int = MIN_UPDATES,
+    unfinished: Callable[[str, str, int], bool] = lambda *_: False,
+    more: str = "",
+) -> Results:
+    """Make results out of a function for the reward and one for psi.
+
+    Each is called with task, algorithm and the number of the agent among all of both seeds, and
+    gives a curve, or one value for all updates, or None where there is no such run.
+    """
+    text = COMMON.format(agents=agents // 2) + more
+    text += "".join(f'\n[[algorithms]]\nname = "{a}"\n{ARGS[a]}\n' for a in algorithms)
+    text += "\n[environments]\n" + "".join(f'"{task}" = "Pendulum-v1"\n' for task in tasks)
+    path, store = folder / "synthetic.toml", Store(folder / "results")
+    path.write_text(text)
+    suite = load_suite(str(path))
+    for run in suite.runs:
+        number = (run.args["seed"] - 1) * (agents // 2) + run.args["agent"]
+        key = (run.environment, run.algorithm, number)
+        if (curve := reward(*key)) is not None:
+            returns = np.broadcast_to(curve, updates)
+            write_run(store, run, returns, psi(*key), done=not unfinished(*key))
+    return load_results(suite, store)
+
+
+@pytest.fixture
+def study(tmp_path) -> Callable[..., Results]:
+    """`make_study` in this test's folder; a second study takes the place of the first."""
+    return functools.partial(make_study, tmp_path)
+
+
+@pytest.fixture
+def drawn(monkeypatch) -> Iterator[Callable[[], Figure]]:
+    """Gives the last figure, which is kept open for it."""
+    with monkeypatch.context() as patch:
+        patch.setattr(plt, "close", lambda figure: None)
+        yield plt.gcf
+    plt.close("all")

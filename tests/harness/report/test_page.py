@@ -1,0 +1,267 @@
+"""The page: everything is in it, nothing of a suite's text is taken for HTML, and it is stable."""
+
+from __future__ import annotations
+
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from harness.report.claims import MIN_UPDATES, Claim, to_frame
+from harness.report.page import write_report
+from harness.report.results import Results, load_results
+from harness.report.table1 import Cell
+from harness.suite import load_suite
+from tests.harness.conftest import write_run
+from tests.harness.report.conftest import make_study
+
+VOID = {"meta", "img", "br", "hr", "link"}
+OPTIONAL = {"html"}  # end tags that HTML does not ask for
+RISING = np.linspace(0.0, 1.0, MIN_UPDATES)
+MORE = """
+[figures]
+"Figure 2: PPO and PPO reg" = ["PPO", "PPO reg"]
+
+[[sweeps]]
+name = "size of delta"
+baseline = "ppo_reg"
+parameter = "radius"
+values = [0.1, 2]
+"""
+
+
+class Page(HTMLParser):
+    """A parsed page: its elements, its text, and a complaint about any tag that does not match."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[str] = []
+        self.images: list[dict[str, str]] = []
+        self.verdicts: list[tuple[str, str]] = []  # classes and text
+        self.cells: list[list[str]] = []
+        self.headings: list[str] = []
+        self.texts: list[str] = []
+        self._class = ""
+        self.feed(text)
+        self.close()
+        assert set(self.open) <= OPTIONAL, self.open
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        values = dict(attrs)
+        self._class = values.get("class") or ""
+        if tag == "img":
+            self.images.append(values)
+        if tag == "tr":
+            self.cells.append([])
+        if tag in ("td", "th"):
+            self.cells[-1].append("")
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.texts.append(data)
+        if self.open and self.open[-1] == "h2":
+            self.headings.append(data)
+        if {"td", "th"} & set(self.open):
+            self.cells[-1][-1] += data
+        if self.open and self.open[-1] == "span" and "verdict" in self._class.split():
+            self.verdicts.append((self._class, data))
+
+    @property
+    def text(self) -> str:
+        return "".join(self.texts)
+
+
+@pytest.fixture
+def report(store):
+    """Writes the report of some results, and gives its folder, findings and parsed page."""
+
+    def write(results):
+        folder = store.report_path(results.suite.name)
+        _, claims = write_report(results, folder)
+        return folder, claims, Page((folder / "report.html").read_text())
+
+    return write
+
+
+class Written(NamedTuple):
+    """A report of 40 agents: claim (a) is supported, (b) not, since half gain and half lose."""
+
+    results: Results
+    folder: Path
+    cells: list[Cell]
+    claims: list[Claim]
+    page: Page
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory) -> Written:
+    folder = tmp_path_factory.mktemp("written")
+    results = make_study(
+        folder,
+        lambda _, name, agent: agent + RISING + (agent % 2 - 0.5) * (name == "PPO reg"),
+        lambda _, name, agent: 12.0 - agent - RISING,
+        tasks=("Hopper", "Ant"), more=MORE,
+    )  # fmt: skip
+    report = folder / "report"
+    report.mkdir()
+    cells, claims = write_report(results, report)
+    page = Page((report / "report.html").read_text())
+    return Written(results, report, cells, claims, page)
+
+
+def test_the_page_shows_every_figure_and_each_is_there(written):
+    folder, page = written.folder, written.page
+    files = [image["src"] for image in page.images]
+    assert sorted(files) == [
+        "ablation_1.png",
+        "claim_a.png",
+        "claim_b.png",
+        "learning_curves_1.png",
+        "psi_and_reward.png",
+    ]
+    assert sorted(path.name for path in folder.glob("*.png")) == sorted(files)
+    for image in page.images:
+        assert (folder / image["src"]).read_bytes().startswith(b"\x89PNG")
+        assert image["alt"] in page.headings
+
+
+def test_a_logged_spectrum_has_its_figure(store, suite, report):
+    names = ("quotient_q50", "singular_value_mean", "squared_singular_value")
+    columns = {f"conditioning/{name}": [1.0, 2.0] for name in names}
+    write_run(store, suite.runs[0], [1.0, 2.0], columns=columns)
+    folder, _, page = report(load_results(suite, store))
+    assert "quotient_and_spectrum.png" in [image["src"] for image in page.images]
+    assert (folder / "quotient_and_spectrum.png").exists()
+
+
+@pytest.mark.parametrize("runs", [0, 1])
+def test_few_runs_make_a_page_without_a_verdict(store, suite, report, runs):
+    for spec in suite.runs[:runs]:
+        write_run(store, spec, [1.0, 2.0])
+    folder, _, page = report(load_results(suite, store))
+    assert {text for _, text in page.verdicts} == {"too few runs to tell"}
+    assert {"report.html", "table1.md", "table1.csv", "claims.csv"} <= {
+        path.name for path in folder.iterdir()
+    }
+    for image in page.images:
+        assert (folder / image["src"]).exists()
+
+
+def test_the_page_says_the_verdicts(written):
+    claims, page = written.claims, written.page
+    assert [claim.verdict for claim in claims] == ["supported", "not supported"]
+    rows = {cells[0]: cells[1].strip() for cells in page.cells if cells[0].startswith("(")}
+    assert rows == {f"({c.letter}) {c.statement}": c.verdict for c in claims}
+
+
+def test_only_what_is_supported_looks_so(written):
+    """The style sheet colours the classes "supported" and "contradicted"."""
+    page = written.page
+    coloured = {text: set(name.split()) & {"supported", "contradicted"}
+                for name, text in page.verdicts}  # fmt: skip
+    assert coloured == {"supported": {"supported"}, "not supported": set()}
+
+
+def test_the_page_has_every_number_behind_the_verdicts(written):
+    claims, page = written.claims, written.page
+    rows = [cells for cells in page.cells if len(cells) == 6]
+    findings = [f for claim in claims for f in claim.findings]
+    shown = [row for row in rows if row[0] != "about"]
+    assert [(row[0], row[1], row[4], row[5]) for row in shown] == [
+        (f.about, f.task, str(f.estimate.n), f.verdict) for f in findings
+    ]
+    assert [float(row[2]) for row in shown] == pytest.approx(
+        [f.estimate.mean for f in findings], rel=0.01, abs=1e-12
+    )
+
+
+def test_the_papers_numbers_stand_beside_ours(written):
+    page = written.page
+    header = next(cells for cells in page.cells if cells[0] == "task")
+    assert header == ["task", "PPO", "PPO, paper", "PPO reg", "PPO reg, paper"]
+    rows = {cells[0]: cells for cells in page.cells if len(cells) == 5}
+    assert rows["Hopper"][2::2] == ["106.8", "18.6"]
+    assert rows["Ant"][2::2] == ["414.1", "294.8"]
+    assert rows["Hopper"][1].startswith("5.0 [")  # agents 0 to 9, and half a step of learning
+
+
+def test_the_notes_of_the_table_are_on_the_page(written):
+    page = written.page
+    assert "The paper has 10 agents for each of 3 seeds." in page.text
+    assert "Shorter runs can neither confirm nor refute it." in page.text
+
+
+HOSTILE = "<script>alert('1')</script>"
+HOSTILE_SUITE = f"""
+title = "{HOSTILE}"
+note = "<b>bold</b> & \\"quoted\\""
+seeds = [1]
+agents = 1
+
+[args]
+total_timesteps = 200
+num_steps = 100
+num_minibatches = 2
+
+[[algorithms]]
+name = "{HOSTILE}"
+baseline = "ppo_reg"
+args = {{ coefficient = 0.0 }}
+
+[[sweeps]]
+name = "<i>sweep"
+baseline = "ppo_reg"
+parameter = "radius"
+values = [2.0]
+
+[figures]
+'"><img src=x onerror=alert(1)>' = ["{HOSTILE}"]
+
+[environments]
+"<em>Hopper" = "Pendulum-v1"
+"""
+
+
+def test_names_of_a_suite_are_text_and_never_html(tmp_path, store, report):
+    (tmp_path / "hostile.toml").write_text(HOSTILE_SUITE)
+    suite = load_suite(str(tmp_path / "hostile.toml"))
+    for spec in suite.runs:
+        write_run(store, spec, [1.0, 2.0])
+    _, _, page = report(load_results(suite, store))
+    assert not {"script", "b", "i", "em"} & set(page.tags)
+    assert all(set(image) == {"src", "alt"} for image in page.images)
+    assert "x" not in [image["src"] for image in page.images]
+    assert '"><img src=x onerror=alert(1)>' in page.headings
+    header = next(cells for cells in page.cells if cells[0] == "task")
+    assert header[1] == HOSTILE
+    assert '<b>bold</b> & "quoted"' in page.text
+    assert "Ablation: <i>sweep" in page.headings
+    assert "<em>Hopper" in [cells[0] for cells in page.cells]
+
+
+def test_claims_as_csv_are_the_findings(written):
+    saved = pd.read_csv(written.folder / "claims.csv")
+    expected = to_frame(written.claims)
+    pd.testing.assert_frame_equal(saved, expected, check_dtype=False, rtol=1e-12)
+    assert len(saved) == sum(len(claim.findings) for claim in written.claims)
+
+
+def test_table_1_as_csv_is_the_cells(written):
+    saved = pd.read_csv(written.folder / "table1.csv")
+    assert saved["mean"].tolist() == pytest.approx([c.estimate.mean for c in written.cells])
+    assert saved["paper"].tolist() == [106.8, 18.6, 414.1, 294.8]
+
+
+def test_a_second_report_is_the_same_to_the_byte(written, tmp_path):
+    write_report(written.results, tmp_path)
+    first = {path.name: path.read_bytes() for path in written.folder.iterdir()}
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == first
