@@ -24,7 +24,7 @@ from harness.statistics import (
     verdict,
 )
 
-MIN_UPDATES = 100  # of every run; shorter ones tell of the beginning of training only
+MIN_UPDATES = 200  # of every run; in shorter ones the last 100 updates are also the early ones
 EARLY = 0.1  # share of the updates that count as "from the first steps"
 PAIRS = {
     "b": [("PPO", "PPO reg"), ("TRPO", "TRPO reg")],
@@ -123,23 +123,20 @@ def comparison_claim(agents: pd.DataFrame, letter: str, planned: set[tuple[str, 
             verdicts.append(TOO_FEW)
         if not differences:
             continue
-        each = [
-            _finding(f"{about}: reward", task, estimate_mean(d["raw"].to_numpy()), +1)
-            for task, d in differences.items()
-        ]
-        standard = [d["standard"].to_numpy() for d in differences.values()]
-        middle, least = interquartile_mean(standard), min(map(len, standard))
-        wins = np.concatenate(
-            [np.heaviside(d["raw"].to_numpy(), 0.5) for d in differences.values()]
-        )
-        probability = estimate_mean(wins)
-        findings += [
-            *each,
-            Finding(f"{about}: in standard deviations, interquartile mean", "all", middle,
-                    verdict(middle, +1) if least >= MIN_AGENTS else TOO_FEW),
-            Finding(f"{about}: probability of improvement", "all", probability,
-                    verdict(_shift(probability, -0.5), +1)),
-        ]  # fmt: skip
+        raw = {task: d["raw"].to_numpy() for task, d in differences.items()}
+        standard = {task: d["standard"].to_numpy() for task, d in differences.items()}
+        wins = {task: np.heaviside(values, 0.5) for task, values in raw.items()}
+        middle, least = interquartile_mean(list(standard.values())), min(map(len, raw.values()))
+        each = [_finding(f"{about}: reward", t, estimate_mean(v), +1) for t, v in raw.items()]
+        about_standard = f"{about}: in standard deviations (all: interquartile mean)"
+        findings += each
+        findings += [_finding(about_standard, t, estimate_mean(v), +1) for t, v in standard.items()]
+        overall = verdict(middle, +1) if least >= MIN_AGENTS else TOO_FEW
+        findings.append(Finding(about_standard, "all", middle, overall))
+        for task, values in {**wins, "all": np.concatenate(list(wins.values()))}.items():
+            chance = estimate_mean(values)
+            judged = verdict(_shift(chance, -0.5), +1)
+            findings.append(Finding(f"{about}: probability of improvement", task, chance, judged))
         verdicts.append(most_of([f.verdict for f in each]))
     return Claim(letter, STATEMENTS[letter], agreed(verdicts), findings)
 

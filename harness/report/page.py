@@ -47,6 +47,9 @@ def _draw(results: Results, found: list[claims.Claim], folder: Path) -> list[tup
         pictures.append((f"Ablation: {name}", f"ablation_{i}.png"))
         study.sweep(results, agents, name, folder / pictures[-1][1])
     if study.quotient_and_spectrum(results, folder / "quotient_and_spectrum.png"):
-        title = "J against the exact mean singular value (yellow: late in training)"
+        title = (
+            "What J is worth: J against the exact mean singular value (yellow: late in training). "
+            "With fewer actions than observed numbers J is smaller by design"
+        )
         pictures.append((title, "quotient_and_spectrum.png"))
     return pictures

@@ -36,6 +36,8 @@ def findings(claim: Claim, path: Path) -> None:
     """A claim's estimates with their 95% intervals, a panel for each kind of number."""
     kinds: dict[str, list[Finding]] = {}
     for finding in claim.findings:
+        if finding.about.endswith(": reward"):
+            continue  # the scales of the tasks differ by thousands: the page lists these
         kinds.setdefault(finding.about, []).append(finding)
     ordered = sorted(kinds.items(), key=lambda kind: -len(kind[1]))  # equals share a row
     heights = [1 + 0.32 * len(found) for _, found in ordered[::2]]
