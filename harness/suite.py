@@ -113,6 +113,49 @@ def load_suite(
     for flag, value in (("total_timesteps", total_timesteps), ("seeds", seeds), ("agents", agents)):
         if value is not None and value < 1:
             raise SuiteError(f"{flag} must be at least 1, got {value}")
+    path, data = _read(name)
+    _known(dict.fromkeys(env), set(data["environments"]), "environment")
+    if seeds is not None and seeds > len(data["seeds"]):
+        raise SuiteError(f"{path.name} has {len(data['seeds'])} seeds, fewer than {seeds}")
+    scaled = {
+        **data,
+        "seeds": data["seeds"][:seeds],
+        "agents": agents or data["agents"],
+        "args": {
+            **data["args"],
+            "total_timesteps": total_timesteps or data["args"]["total_timesteps"],
+        },
+        "environments": {k: v for k, v in data["environments"].items() if k in env or not env},
+    }
+    sweeps = _sweeps(data, path)
+    algorithms = [*data["algorithms"], *(a for made in sweeps.values() for a in made.values())]
+    for algorithm in algorithms:
+        _check_keys(algorithm, {"name", "baseline"}, ALGORITHM_KEYS, f"{path.name}: algorithm")
+        _known(dict.fromkeys(algorithm.get("environments", ())), set(data["environments"]),
+               f"{path.name}: {algorithm['name']}: environment")  # fmt: skip
+    runs = [run for algorithm in algorithms for run in _runs(algorithm, scaled, path)]
+    if not runs:
+        raise SuiteError(f"{path.name} has no runs: it needs algorithms, environments and seeds")
+    if len({run.run_id for run in runs}) < len(runs):
+        raise SuiteError(f"{path.name}: names of algorithms and seeds must differ from each other")
+    for title, named in data.get("figures", {}).items():
+        if not _fits(named, tuple[str, ...]):
+            raise SuiteError(f"{path.name}: figure {title!r} must list algorithms, got {named!r}")
+        _known(dict.fromkeys(named), {a["name"] for a in algorithms}, f"{path.name}: algorithm")
+    return Suite(
+        name=path.stem,
+        title=data["title"],
+        note=data.get("note", ""),
+        algorithms=[algorithm["name"] for algorithm in algorithms],
+        environments=list(scaled["environments"]),
+        runs=runs,
+        figures=data.get("figures", {}),
+        sweeps={k: {v: a["name"] for v, a in made.items()} for k, made in sweeps.items()},
+    )
+
+
+def _read(name: str) -> tuple[Path, dict[str, Any]]:
+    """A suite's file, its keys and their types checked."""
     path = Path(name) if name.endswith(".toml") else SUITES / f"{name}.toml"
     if not path.exists():
         known = f"there are {', '.join(suite_names())}"
@@ -127,57 +170,31 @@ def load_suite(
             raise SuiteError(f"{path.name}: {key} must be of type {hint}, got {data[key]!r}")
     if "total_timesteps" not in data["args"]:
         raise SuiteError(f"{path.name}: args needs total_timesteps")
-    _known(dict.fromkeys(env), set(data["environments"]), "environment")
-    if seeds is not None and seeds > len(data["seeds"]):
-        raise SuiteError(f"{path.name} has {len(data['seeds'])} seeds, fewer than {seeds}")
-    environments = {k: v for k, v in data["environments"].items() if k in env or not env}
-    common = data["args"] | (
-        {} if total_timesteps is None else {"total_timesteps": total_timesteps}
-    )
+    return path, data
+
+
+def _runs(algorithm: dict[str, Any], data: dict[str, Any], path: Path) -> list[RunSpec]:
+    """One algorithm's runs on its environments, seeds and agents, their arguments checked."""
     runs = []
-    sweeps = _sweeps(data, path)
-    algorithms = [*data["algorithms"], *(a for made in sweeps.values() for a in made.values())]
-    for algorithm in algorithms:
-        _check_keys(algorithm, {"name", "baseline"}, ALGORITHM_KEYS, f"{path.name}: algorithm")
-        _known(dict.fromkeys(algorithm.get("environments", ())), set(data["environments"]),
-               f"{path.name}: {algorithm['name']}: environment")  # fmt: skip
-        for environment in algorithm.get("environments", data["environments"]):
-            if environment not in environments:
-                continue
-            env_id = environments[environment]
-            args = {"env_id": env_id, **common, **algorithm.get("args", {})}
-            where = f"{path.name}: {algorithm['name']} on {environment}"
-            for seed in data["seeds"]:
-                check_args(algorithm["baseline"], {**args, "seed": seed, "agent": 0}, where)
-            runs += [
-                RunSpec(
-                    suite=path.stem,
-                    algorithm=algorithm["name"],
-                    environment=environment,
-                    baseline=algorithm["baseline"],
-                    args={**args, "seed": seed, "agent": agent},
-                )
-                for seed in data["seeds"][:seeds]
-                for agent in range(agents or data["agents"])
-            ]
-    if not runs:
-        raise SuiteError(f"{path.name} has no runs: it needs algorithms, environments and seeds")
-    if len({run.run_id for run in runs}) < len(runs):
-        raise SuiteError(f"{path.name}: names of algorithms and seeds must differ from each other")
-    for title, named in data.get("figures", {}).items():
-        if not _fits(named, tuple[str, ...]):
-            raise SuiteError(f"{path.name}: figure {title!r} must list algorithms, got {named!r}")
-        _known(dict.fromkeys(named), {a["name"] for a in algorithms}, f"{path.name}: algorithm")
-    return Suite(
-        name=path.stem,
-        title=data["title"],
-        note=data.get("note", ""),
-        algorithms=[algorithm["name"] for algorithm in algorithms],
-        environments=list(environments),
-        runs=runs,
-        figures=data.get("figures", {}),
-        sweeps={k: {v: a["name"] for v, a in made.items()} for k, made in sweeps.items()},
-    )
+    for environment, env_id in data["environments"].items():
+        if environment not in algorithm.get("environments", data["environments"]):
+            continue
+        args = {"env_id": env_id, **data["args"], **algorithm.get("args", {})}
+        where = f"{path.name}: {algorithm['name']} on {environment}"
+        for seed in data["seeds"]:
+            check_args(algorithm["baseline"], {**args, "seed": seed, "agent": 0}, where)
+        runs += [
+            RunSpec(
+                suite=path.stem,
+                algorithm=algorithm["name"],
+                environment=environment,
+                baseline=algorithm["baseline"],
+                args={**args, "seed": seed, "agent": agent},
+            )
+            for seed in data["seeds"]
+            for agent in range(data["agents"])
+        ]
+    return runs
 
 
 def _sweeps(data: dict[str, Any], path: Path) -> dict[str, dict[Any, dict[str, Any]]]:

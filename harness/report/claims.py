@@ -157,8 +157,11 @@ def paired_differences(agents: pd.DataFrame, first: str, second: str) -> dict[st
     for task in agents["environment"].unique():
         if task in wide.index.get_level_values("environment"):
             both = wide.xs(task, level="environment")
-            raw, deviation = both[second] - both[first], both.to_numpy().std()
-            found[task] = pd.DataFrame({"raw": raw, "standard": raw / (deviation or 1.0)})
+            raw = both[second] - both[first]
+            deviation = both.to_numpy().std() or 1.0
+            if len(both) < 2:  # one pair is always 2 of its own deviations apart
+                deviation = np.nan
+            found[task] = pd.DataFrame({"raw": raw, "standard": raw / deviation})
     return found
 
 
