@@ -9,6 +9,7 @@ import pandas as pd
 from scipy import stats
 
 RESAMPLES = 10_000
+LAST_UPDATES = 100  # that the paper's Table 1 is a mean over
 MIN_AGENTS = 10  # below, bootstrap intervals are too narrow to rest a verdict on
 TOO_FEW = "too few runs to tell"
 
@@ -22,7 +23,7 @@ class Estimate(NamedTuple):
     n: int
 
 
-def final_score(metrics: pd.DataFrame, updates: int = 100) -> float:
+def final_score(metrics: pd.DataFrame, updates: int = LAST_UPDATES) -> float:
     """Mean reward of one agent over its last updates: Table 1's measure.
 
     An update's value is the mean return of the episodes that ended in it; updates in which none

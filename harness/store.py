@@ -45,10 +45,9 @@ class Store:
 
     def state(self, spec: RunSpec) -> str:
         """One of STATES; "changed" where the folder holds a run of another configuration."""
-        saved = _read_json(self.path(spec, "spec.json"))
-        if saved is None:
+        if not self.path(spec, "spec.json").exists():
             return "pending"
-        if saved["hash"] != spec.hash:
+        if self.changes(spec):
             return "changed"
         if self.is_done(spec):
             return "done"
@@ -61,13 +60,17 @@ class Store:
         done = _read_json(self.path(spec, "done.json"))
         return done is not None and done["hash"] == spec.hash
 
+    def changes(self, spec: RunSpec) -> str:
+        """How the configuration that the folder was run with differs; empty if it does not."""
+        saved = _read_json(self.path(spec, "spec.json"))
+        return "" if saved is None or saved["hash"] == spec.hash else _difference(saved, spec)
+
     def refuse_changed(self, spec: RunSpec) -> None:
         """Raise StoreError if the folder holds a run of another configuration."""
-        saved = _read_json(self.path(spec, "spec.json"))
-        if saved is not None and saved["hash"] != spec.hash:
+        if changes := self.changes(spec):
             raise StoreError(
-                f"{self.path(spec)} was run with another configuration "
-                f"({_difference(saved, spec)}): name another --results-dir, or remove it"
+                f"{self.path(spec)} was run with another configuration ({changes}): "
+                "name another --results-dir, or remove it"
             )
 
     @contextlib.contextmanager

@@ -11,6 +11,7 @@ import re
 import tomllib
 import types
 import typing
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,11 @@ class Suite:
     """figures of learning curves: a title, and the algorithms in it"""
     sweeps: dict[str, dict[str, Any]]
     """for each ablation, the algorithm that each value of its parameter makes"""
+
+    @property
+    def planned(self) -> Counter[tuple[str, str]]:
+        """Runs of each (environment, algorithm)."""
+        return Counter((run.environment, run.algorithm) for run in self.runs)
 
     @property
     def timesteps(self) -> int:

@@ -13,6 +13,7 @@ import pandas as pd
 
 from harness.report.results import Results
 from harness.statistics import (
+    LAST_UPDATES,
     MIN_AGENTS,
     TOO_FEW,
     Estimate,
@@ -78,7 +79,7 @@ def agent_table(results: Results) -> pd.DataFrame:
                 "done": run.run_id in results.done,
                 "updates": len(metrics),
                 "reward": final_score(metrics),
-                "psi": psi.tail(100).mean(),
+                "psi": psi.tail(LAST_UPDATES).mean(),
                 "early_psi": psi.head(max(1, round(EARLY * len(psi)))).mean(),
                 "together": spearman(pairs[None])[0] if len(pairs) > 2 else np.nan,
             }
@@ -186,7 +187,7 @@ def make_claims(results: Results) -> list[Claim]:
     """Claims (a), (b) and (c), as far as the suite's complete runs speak of them."""
     agents = agent_table(results)
     agents = agents[agents["done"]]  # one that still learns is no match for one that is done
-    planned = {(run.environment, run.algorithm) for run in results.suite.runs}
+    planned = set(results.suite.planned)
     compared = (comparison_claim(agents, letter, planned) for letter in "bc")
     claims = [conditioning_claim(agents), *compared]
     if (agents["updates"] < MIN_UPDATES).any():

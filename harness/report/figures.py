@@ -28,7 +28,7 @@ def learning_curves(results: Results, algorithms: list[str], path: Path) -> None
 
     A panel for each task that the suite plans for all of these algorithms and that has runs.
     """
-    planned = {(run.environment, run.algorithm) for run in results.suite.runs}
+    planned = results.suite.planned
     tasks = [
         task
         for task in results.suite.environments

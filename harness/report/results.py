@@ -40,7 +40,7 @@ def load_results(suite: Suite, store: Store) -> Results:
     """Read what there is; runs may be unfinished, or still be running."""
     metrics, changed, done = {}, [], []
     for run in suite.runs:
-        if store.state(run) == "changed":
+        if store.changes(run):
             changed.append(run.run_id)
         elif (found := store.metrics(run)) is not None:
             metrics[run.run_id] = found

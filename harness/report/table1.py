@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import tomllib
-from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -15,10 +14,8 @@ import pandas as pd
 from rich.table import Table
 
 from harness.report.results import Results
-from harness.statistics import Estimate, estimate_mean, final_score
+from harness.statistics import LAST_UPDATES, Estimate, estimate_mean, final_score
 from harness.suite import Suite
-
-LAST_UPDATES = 100
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,14 +54,14 @@ def make_cells(results: Results) -> list[Cell]:
     """A cell for each environment and algorithm, from whatever has been run so far."""
     suite, paper = results.suite, paper_numbers()
     algorithms = [a for a in suite.algorithms if a in paper] or suite.algorithms
-    planned = Counter((run.environment, run.algorithm) for run in suite.runs)
+    planned = suite.planned
     seeds = {run.run_id: run.args["seed"] for run in suite.runs}
     cells = []
     for environment, algorithm in itertools.product(suite.environments, algorithms):
         if not planned[environment, algorithm]:
             continue
         found = results.of(environment, algorithm)
-        scores = {k: final_score(m, LAST_UPDATES) for k, m in found.items()}
+        scores = {k: final_score(m) for k, m in found.items()}
         scores = {k: score for k, score in scores.items() if not np.isnan(score)}
         cells.append(
             Cell(

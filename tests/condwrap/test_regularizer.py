@@ -13,6 +13,7 @@ from torch import nn
 from torch.nn.utils import parametrizations
 
 from condwrap import ConditioningRegularizer, sphere
+from tests.condwrap.helpers import stochastic
 
 # PyTorch itself scripts what forward mode and inductor import
 pytestmark = pytest.mark.filterwarnings(
@@ -26,16 +27,6 @@ def mlp(scale=1.0):
     net = nn.Sequential(nn.Linear(4, 16), nn.Tanh(), nn.Linear(16, 3))
     with torch.no_grad():
         net[2].weight.mul_(scale)
-    return net
-
-
-def stochastic():
-    """Batch norm and dropout, both in training mode, with statistics of some data."""
-    net = nn.Sequential(
-        nn.Linear(4, 16), nn.BatchNorm1d(16), nn.Tanh(), nn.Dropout(0.5), nn.Linear(16, 3)
-    )
-    for _ in range(5):
-        net(torch.randn(32, 4))
     return net
 
 

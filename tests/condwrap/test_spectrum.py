@@ -21,6 +21,7 @@ from condwrap.spectrum import (
     mean_squared_singular_value,
     squared_frobenius_norm,
 )
+from tests.condwrap.helpers import stochastic
 
 # PyTorch itself scripts what forward mode imports
 pytestmark = pytest.mark.filterwarnings(
@@ -617,16 +618,6 @@ def test_one_chunk_of_jacobians_is_held_at_a_time(measure):
 
 
 # --- randomness and no trace ------------------------------------------------------------------
-
-
-def stochastic():
-    """Batch norm and dropout, both in training mode, with statistics of some data."""
-    net = nn.Sequential(
-        nn.Linear(4, 16), nn.BatchNorm1d(16), nn.Tanh(), nn.Dropout(0.5), nn.Linear(16, 3)
-    )
-    for _ in range(5):
-        net(torch.randn(32, 4))
-    return net
 
 
 @every_measure
