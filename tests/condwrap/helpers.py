@@ -1,4 +1,4 @@
-"""Policies that several test files measure."""
+"""What several test files measure, and measure against."""
 
 from __future__ import annotations
 
@@ -14,3 +14,15 @@ def stochastic():
     for _ in range(5):
         net(torch.randn(32, 4))
     return net
+
+
+def central_differences(policy, obs, step=1e-5):
+    """[B, m, n] of a policy that maps a float64 tensor to one, states apart."""
+    columns = []
+    for k in range(obs[0].numel()):
+        shift = torch.zeros(len(obs), obs[0].numel(), dtype=obs.dtype)
+        shift[:, k] = step
+        shift = shift.reshape(obs.shape)
+        change = policy(obs + shift) - policy(obs - shift)
+        columns.append(change.reshape(len(obs), -1) / (2 * step))
+    return torch.stack(columns, -1).detach().numpy()

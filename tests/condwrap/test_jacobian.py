@@ -11,6 +11,7 @@ from torch import distributions as td
 from torch import nn
 
 from condwrap.jacobian import jacobians, read_states, response, zero_delta
+from tests.condwrap.helpers import central_differences
 
 # PyTorch itself scripts what forward mode imports
 pytestmark = pytest.mark.filterwarnings(
@@ -21,18 +22,6 @@ pytestmark = pytest.mark.filterwarnings(
 def jacobian(policy, obs, output="default", chunk_size=100):
     states = read_states(obs, output)
     return torch.cat(list(jacobians(policy, states, output, chunk_size)))
-
-
-def central_differences(policy, obs, step=1e-5):
-    """[B, m, n] of a policy that maps a float64 tensor to one, states apart."""
-    columns = []
-    for k in range(obs[0].numel()):
-        shift = torch.zeros(len(obs), obs[0].numel(), dtype=obs.dtype)
-        shift[:, k] = step
-        shift = shift.reshape(obs.shape)
-        change = policy(obs + shift) - policy(obs - shift)
-        columns.append(change.reshape(len(obs), -1) / (2 * step))
-    return torch.stack(columns, -1).detach().numpy()
 
 
 class Recurrent(nn.Module):

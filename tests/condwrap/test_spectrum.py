@@ -21,7 +21,7 @@ from condwrap.spectrum import (
     mean_squared_singular_value,
     squared_frobenius_norm,
 )
-from tests.condwrap.helpers import stochastic
+from tests.condwrap.helpers import central_differences, stochastic
 
 # PyTorch itself scripts what forward mode imports
 pytestmark = pytest.mark.filterwarnings(
@@ -48,13 +48,6 @@ drawn_measures = pytest.mark.parametrize("measure", DRAWN)
 
 def mlp(n=4, m=3):
     return nn.Sequential(nn.Linear(n, 16), nn.Tanh(), nn.Linear(16, m))
-
-
-def central_differences(policy, obs, step=1e-5):
-    """[B, m, n] of a policy that maps float64 [B, n] to [B, m], states apart."""
-    shifts = step * torch.eye(obs.shape[1], dtype=obs.dtype)
-    columns = [(policy(obs + s) - policy(obs - s)) / (2 * step) for s in shifts]
-    return torch.stack(columns, -1).detach().numpy()
 
 
 def with_jacobians(matrices):
