@@ -378,7 +378,8 @@ def update(args: Args, learner: Learner, data: Rollout) -> dict[str, float]:
                 entropy = policy.entropy().mean()
                 loss = pg_loss - args.ent_coef * entropy
                 if args.coefficient > 0:  # condwrap
-                    loss = loss + learner.regularizer(actor, obs[i]).penalty  # condwrap
+                    measured = learner.regularizer(actor, obs[i], answer=policy)  # condwrap
+                    loss = loss + measured.penalty  # condwrap
                 step(learner.actor_optimizer, loss, args.max_grad_norm)
                 policy_logs.append(torch.stack([pg_loss, entropy, kl, clipfrac]).detach())
             if epoch < args.vf_epochs:

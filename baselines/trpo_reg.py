@@ -447,9 +447,11 @@ def update(args: Args, learner: Learner, data: Rollout) -> dict[str, float]:
         delta = learner.regularizer.sample_delta(obs)  # condwrap
 
     def objective() -> Tensor:
-        surrogate = ((actor(obs).log_prob(actions) - old_logprobs).exp() * advantages).mean()
+        policy = actor(obs)
+        surrogate = ((policy.log_prob(actions) - old_logprobs).exp() * advantages).mean()
         if args.coefficient > 0:  # condwrap
-            surrogate = surrogate - learner.regularizer(actor, obs, delta=delta).penalty  # condwrap
+            measured = learner.regularizer(actor, obs, delta=delta, answer=policy)  # condwrap
+            surrogate = surrogate - measured.penalty  # condwrap
         return surrogate
 
     def mean_kl() -> Tensor:

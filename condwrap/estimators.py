@@ -12,19 +12,22 @@ from condwrap.observation import States
 from condwrap.policy import Policy, untouched
 
 Respond = Callable[[Any], Tensor]  # obs -> the output that counts, [*batch, m]
-Estimator = Callable[[Policy, Respond, States, Tensor], tuple[Tensor, Tensor]]
+Estimator = Callable[[Policy, Respond, States, Tensor, Tensor | None], tuple[Tensor, Tensor]]
 
 
 def difference(
-    policy: Policy, respond: Respond, states: States, delta: Tensor
+    policy: Policy, respond: Respond, states: States, delta: Tensor, known: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """pi(S) and pi(S + delta), both with the same dropout masks.
+    """pi(S), which may be known already, and pi(S + delta), both with the same dropout masks.
 
     Two evaluations from one state of the global generators share their masks whatever the policy
     is made of; in a compiled region, which cannot rewind them, one vmapped evaluation does.
     """
     clean = states.perturbed
     moved = [x + shift for x, shift in zip(clean, states.displacement(delta), strict=True)]
+    if known is not None:
+        with untouched(policy, states.device):
+            return known, respond(states.obs(moved))
     if torch.compiler.is_compiling():
         pair = [torch.stack(both) for both in zip(clean, moved, strict=True)]
         with untouched(policy, states.device):
@@ -39,8 +42,12 @@ def difference(
     return output, perturbed_output
 
 
-def jvp(policy: Policy, respond: Respond, states: States, delta: Tensor) -> tuple[Tensor, Tensor]:
+def jvp(
+    policy: Policy, respond: Respond, states: States, delta: Tensor, known: Tensor | None
+) -> tuple[Tensor, Tensor]:
     """Jacobian · delta by forward-mode differentiation, and 0: the difference in the limit."""
+    if known is not None:
+        raise ValueError("answer is of use to estimator='difference' only")
     try:
         with untouched(policy, states.device):
             change = torch.func.jvp(

@@ -35,7 +35,7 @@ def check_output(output: Output) -> None:
         )
 
 
-def flat_output(answer: Any, output: Output, batch: torch.Size) -> Tensor:
+def flat_output(answer: Any, output: Output, batch: torch.Size, known: bool = False) -> Tensor:
     """The policy's answer as one floating tensor `[*batch, m]`.
 
     Args:
@@ -45,10 +45,12 @@ def flat_output(answer: Any, output: Output, batch: torch.Size) -> Tensor:
             or Bernoulli. "mean", "logits" and "probs" ask for that attribute of a distribution. A
             callable picks from the answer; what it returns is read as "default" does.
         batch: The leading axes that every tensor must have.
+        known: The answer was computed elsewhere, so perhaps under autocast.
 
     Raises:
         TypeError: An answer that cannot be read, or an integer tensor.
-        ValueError: The selector returned nothing, or a tensor lost the batch axes.
+        ValueError: The selector returned nothing, a tensor lost the batch axes, or a known answer
+            is in half precision.
     """
     if callable(output):
         answer = output(answer)
@@ -70,6 +72,11 @@ def flat_output(answer: Any, output: Output, batch: torch.Size) -> Tensor:
             raise TypeError(
                 f"the policy's output must be floating, got {x.dtype}: "
                 "select the distribution's mean or logits, not the sampled action"
+            )
+        if known and x.dtype in (torch.bfloat16, torch.float16):
+            raise ValueError(
+                f"answer must be float32 at least, got {x.dtype}, whose rounding would pass for "
+                "sensitivity: leave answer out"
             )
     # bf16 and fp16 differences would lose J to rounding
     wide = (x if x.dtype == torch.float64 else x.float() for x in tensors)
@@ -114,6 +121,16 @@ def _parameter(distribution: td.Distribution, output: str) -> Tensor:
     return value  # type: ignore[no-any-return]
 
 
+def check_reusable(policy: Policy) -> None:
+    """Raise if the policy's answer in training differs from what `untouched` would give."""
+    for module in _modules(policy):
+        if module.training and isinstance(module, (_NormBase, nn.modules.dropout._DropoutNd)):
+            raise ValueError(
+                f"answer cannot be used with {type(module).__name__} in training mode, which would "
+                "count as sensitivity: leave answer out"
+            )
+
+
 @contextlib.contextmanager
 def untouched(policy: Policy, device: torch.device) -> Iterator[None]:
     """Evaluate inside this, and the policy and the global generators are as they were.
@@ -123,7 +140,7 @@ def untouched(policy: Policy, device: torch.device) -> Iterator[None]:
     evaluations, each in a context of its own, draw the same dropout masks. A compiled region can
     do neither of the last two.
     """
-    found = list({id(m): m for root in _reachable(policy) for m in root.modules()}.values())
+    found = _modules(policy)
     norms = [m for m in found if isinstance(m, _NormBase) and m.training]
     for norm in norms:
         if norm.running_mean is None:
@@ -155,6 +172,10 @@ def _copied_buffers(modules: list[nn.Module]) -> Iterator[None]:
     finally:
         for module, buffers in kept:
             module._buffers.update(buffers)
+
+
+def _modules(policy: Policy) -> list[nn.Module]:
+    return list({id(m): m for root in _reachable(policy) for m in root.modules()}.values())
 
 
 def _reachable(policy: Any, depth: int = 2) -> Iterator[nn.Module]:

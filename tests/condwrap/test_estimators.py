@@ -155,7 +155,7 @@ def test_both_halves_of_the_difference_share_their_dropout_masks():
     obs = torch.ones(64, 32)
     states = States.read(obs, None, 1)
     policy = nn.Dropout(0.5)
-    clean, moved = ESTIMATORS["difference"](policy, policy, states, torch.ones(64, 32))
+    clean, moved = ESTIMATORS["difference"](policy, policy, states, torch.ones(64, 32), None)
     assert 0.4 < (clean == 0).float().mean() < 0.6
     torch.testing.assert_close(moved, 2 * clean)
 
