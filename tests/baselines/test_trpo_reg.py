@@ -349,9 +349,9 @@ class Spy:
         self.drawn.append(self.regularizer.sample_delta(obs))
         return self.drawn[-1].clone()
 
-    def __call__(self, policy, obs, *, delta):
+    def __call__(self, policy, obs, *, delta, answer):
         self.calls.append((obs.clone(), delta.clone()))
-        return self.regularizer(policy, obs, delta=delta)
+        return self.regularizer(policy, obs, delta=delta, answer=answer)
 
 
 def collected(**changes):
