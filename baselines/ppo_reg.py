@@ -501,7 +501,7 @@ def load_checkpoint(args: Args) -> dict[str, Any] | None:
         raise RunError(f"{args.path} holds a run: --resume it, or name another --run-dir")
     for candidate in found:
         try:
-            saved = torch.load(candidate, weights_only=True)
+            saved = torch.load(candidate, map_location="cpu", weights_only=True)
         except Exception as error:  # whatever a torn file makes the reader stumble over
             print(f"{candidate} cannot be read: {error!r}")
             continue
