@@ -1,4 +1,4 @@
-"""The command line: python -m harness run-all | list | status | report."""
+"""The command line: python -m harness run-all | list | status | evaluate | report."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ import os
 import signal
 import sys
 from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Annotated, Any, Literal
 
+import rich.progress
 import tyro
 from rich.console import Console
 from rich.table import Table
@@ -19,8 +22,10 @@ from harness.progress import Progress, duration
 from harness.report import table1
 from harness.report.page import write_report
 from harness.report.results import Results, load_results
-from harness.store import STATES, Store, StoreError
-from harness.suite import SuiteError, load_suite, suite_names
+from harness.schema import SuiteError, suite_names
+from harness.statistics import estimate_success, success_matrix
+from harness.store import STATES, EvaluationError, Store, StoreError
+from harness.suite import load_suite
 
 app = tyro.extras.SubcommandApp()
 console = Console()
@@ -48,7 +53,7 @@ def run_all(
         jobs: Runs at a time, one core each; by default all cores.
         results_dir: Where the runs' folders and the reports go.
         total_timesteps: Environment steps of each run, instead of the suite's.
-        seeds: Only the first so many seeds.
+        seeds: So many seeds: the suite's first, then those that follow its last.
         agents: Only so many agents for each seed.
         env: Only these tasks, such as Hopper.
     """
@@ -113,6 +118,43 @@ def status(suite: tuple[str, ...] = (), results_dir: Path = Path("results")) -> 
     console.print(table)
 
 
+@app.command(name="evaluate")
+def evaluate(
+    run_dir: Annotated[Path, tyro.conf.Positional],
+    levels: int = 500,
+    repeats: int = 20,
+    unseen: Literal["next", "unbounded"] = "next",
+    device: str = "auto",
+) -> None:
+    """Success rate of a CoinRun agent on its training levels and on levels it never saw.
+
+    Each level counts equally: sampled actions are repeated, greedy ones played once, since a level
+    is deterministic. Every episode goes to evaluation.csv in the run's folder, with a GIF of each
+    kind of level; a second call with the same settings reads it.
+
+    Args:
+        run_dir: Folder of a run of ppo_reg_coinrun, with its checkpoint.pt.
+        levels: Levels of each kind; fewer than the training set has are evenly spaced in it.
+        repeats: Episodes with sampled actions on each level.
+        unseen: The levels after the training set, or ones drawn at random without bound.
+        device: cpu, cuda or cuda:1; auto: a GPU if there is one.
+    """
+    from harness.evaluate import evaluate_run  # imports PyTorch and the simulators
+
+    with rich.progress.Progress(console=console, disable=not console.is_interactive) as bar:
+
+        def show(parts: Iterable[Any], total: int) -> Iterable[Any]:
+            return bar.track(parts, total, description="levels")
+
+        episodes = evaluate_run(run_dir, levels, repeats, unseen, device, show)
+    table = Table("levels", "actions", "success rate", "95% interval over levels")
+    for (split, policy), found in episodes.groupby(["split", "policy"]):
+        rate = estimate_success([success_matrix(found)])
+        interval = f"{100 * rate.low:.1f} to {100 * rate.high:.1f}"
+        table.add_row(split, policy, f"{100 * rate.mean:.1f}%", interval)
+    console.print(table)
+
+
 @app.command(name="report")
 def report(suite: str = DEFAULT_SUITE, results_dir: Path = Path("results")) -> None:
     """Report what a suite's runs show so far, beside the paper's tables.
@@ -172,7 +214,7 @@ def main() -> None:
         signal.signal(signal.SIGHUP, signal.default_int_handler)
     try:
         app.cli(prog="python -m harness", description=__doc__)
-    except (SuiteError, StoreError) as error:
+    except (SuiteError, StoreError, EvaluationError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         say("\nInterrupted: the same command continues from the runs' last checkpoints.")

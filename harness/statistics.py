@@ -123,3 +123,27 @@ def verdict(estimate: Estimate, sign: int) -> str:
     if estimate.low <= 0 <= estimate.high:
         return "not supported"
     return "supported" if (estimate.low > 0) == (sign > 0) else "contradicted"
+
+
+def success_matrix(episodes: pd.DataFrame) -> np.ndarray:
+    """Successes `[levels, repeats]` of episodes that each name their level and repeat."""
+    return episodes.pivot(index="level", columns="repeat", values="success").to_numpy(float)
+
+
+def estimate_success(agents: list[np.ndarray], seed: int = 0) -> Estimate:
+    """Success rate over agents' `[levels, repeats]`, every level counted equally.
+
+    The interval resamples agents, then levels (the same for all agents), then the repeats of each.
+    With one agent it says how the rate may vary over levels, not over training runs. `n` is the
+    number of agents.
+    """
+    rates = np.array([matrix.mean(axis=1) for matrix in agents])  # [agents, levels]
+    if not len(rates):
+        return Estimate(np.nan, np.nan, np.nan, 0)
+    rng, (count, levels) = np.random.default_rng(seed), rates.shape
+    repeats, means = agents[0].shape[1], np.empty(2000)
+    for i in range(len(means)):
+        picked = rates[rng.integers(count, size=count)][:, rng.integers(levels, size=levels)]
+        means[i] = rng.binomial(repeats, picked).mean() / repeats
+    low, high = np.percentile(means, (2.5, 97.5))
+    return Estimate(float(rates.mean()), float(low), float(high), count)

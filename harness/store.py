@@ -29,6 +29,10 @@ class StoreError(RuntimeError):
     """Results that cannot be used as they are, and what to do."""
 
 
+class EvaluationError(RuntimeError):
+    """A run that cannot be evaluated, and why."""
+
+
 class Store:
     """The results folder."""
 
@@ -57,12 +61,12 @@ class Store:
         return "failed" if self.path(spec, "failed.json").exists() else "interrupted"
 
     def is_done(self, spec: RunSpec) -> bool:
-        done = _read_json(self.path(spec, "done.json"))
+        done = read_json(self.path(spec, "done.json"))
         return done is not None and done["hash"] == spec.hash
 
     def changes(self, spec: RunSpec) -> str:
         """How the configuration that the folder was run with differs; empty if it does not."""
-        saved = _read_json(self.path(spec, "spec.json"))
+        saved = read_json(self.path(spec, "spec.json"))
         return "" if saved is None or saved["hash"] == spec.hash else _difference(saved, spec)
 
     def refuse_changed(self, spec: RunSpec) -> None:
@@ -99,10 +103,8 @@ class Store:
         if returncode:
             write_json(self.path(spec, "failed.json"), {"returncode": returncode})
             return
-        files = {
-            name: hashlib.sha256(self.path(spec, name).read_bytes()).hexdigest()
-            for name in ("metrics.csv", "checkpoint.pt")
-        }
+        names = ["metrics.csv", "checkpoint.pt", *(["evaluation.csv"] if spec.evaluation else [])]
+        files = {n: hashlib.sha256(self.path(spec, n).read_bytes()).hexdigest() for n in names}
         content = {"hash": spec.hash, "seconds": round(seconds, 1), "sha256": files}
         write_json(self.path(spec, "done.json"), content)
 
@@ -155,7 +157,7 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
     temporary.replace(path)
 
 
-def _read_json(path: Path) -> dict[str, Any] | None:
+def read_json(path: Path) -> dict[str, Any] | None:
     try:
         return json.loads(path.read_text())
     except FileNotFoundError:

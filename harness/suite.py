@@ -3,29 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import hashlib
-import importlib
 import json
 import re
-import tomllib
-import types
-import typing
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
+from harness.schema import SuiteError, check_args, check_keys, fits, known, read
 
-SUITES = Path(__file__).parent / "suites"
-REQUIRED = {"title", "seeds", "agents", "args", "algorithms", "environments"}
-KEYS = REQUIRED | {"note", "figures", "sweeps"}
 ALGORITHM_KEYS = {"name", "baseline", "args", "environments"}
 SWEEP_KEYS = ALGORITHM_KEYS | {"parameter", "values"}
-
-
-class SuiteError(ValueError):
-    """A suite that cannot be run, and why."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +29,8 @@ class RunSpec:
     """module in baselines/"""
     args: dict[str, Any]
     """of the baseline: env_id, seed, agent, total_timesteps, and what the suite sets"""
+    evaluation: dict[str, int] = dataclasses.field(default_factory=dict)
+    """levels and repeats that the trained agent is evaluated on; empty for control tasks"""
 
     @property
     def run_id(self) -> str:
@@ -50,7 +40,8 @@ class RunSpec:
     @property
     def hash(self) -> str:
         """Tells a changed configuration from a finished one."""
-        content = json.dumps([self.baseline, self.args], sort_keys=True)
+        settings = [self.baseline, self.args, *([self.evaluation] if self.evaluation else [])]
+        content = json.dumps(settings, sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()
 
     @property
@@ -92,10 +83,6 @@ class Suite:
         return sum(run.args["total_timesteps"] for run in self.runs)
 
 
-def suite_names() -> list[str]:
-    return sorted(path.stem for path in SUITES.glob("*.toml"))
-
-
 def load_suite(
     name: str,
     *,
@@ -109,7 +96,7 @@ def load_suite(
     Args:
         name: The name of a file in harness/suites, or the path of a TOML file.
         total_timesteps: Environment steps of each run, instead of the suite's.
-        seeds: Take only the first so many seeds.
+        seeds: Take so many seeds: the suite's first, then those that follow its last.
         agents: Train only so many agents for each seed.
         env: Take only these environments, by the names that the tables use.
 
@@ -119,64 +106,78 @@ def load_suite(
     for flag, value in (("total_timesteps", total_timesteps), ("seeds", seeds), ("agents", agents)):
         if value is not None and value < 1:
             raise SuiteError(f"{flag} must be at least 1, got {value}")
-    path, data = _read(name)
-    _known(dict.fromkeys(env), set(data["environments"]), "environment")
-    if seeds is not None and seeds > len(data["seeds"]):
-        raise SuiteError(f"{path.name} has {len(data['seeds'])} seeds, fewer than {seeds}")
-    scaled = {
+    path, data = read(name)
+    included = [read(other) for other in data.get("include", [])]
+    for other, its in included:
+        if "algorithms" not in its:
+            raise SuiteError(f"{path.name} includes {other.stem}, which has no runs of its own")
+    files = [(p, d) for p, d in [(path, data), *included] if "algorithms" in d]
+    there = {environment for _, d in files for environment in d["environments"]}
+    known(dict.fromkeys(env), there, "environment")
+    parts = [_own_runs(p, _scaled(d, total_timesteps, seeds, agents, env)) for p, d in files]
+    runs = {run.hash: run for part in reversed(parts) for run in reversed(part.runs)}
+    runs = list(reversed(runs.values()))  # one that several suites have is run once, by the first
+    if not runs:
+        raise SuiteError(f"{path.name} has no runs: it needs algorithms, environments and seeds")
+    cells = {(r.algorithm, r.environment, r.args["seed"], r.args["agent"]) for r in runs}
+    if len(cells) < len(runs):
+        raise SuiteError(f"{path.name}: names of algorithms and seeds must differ from each other")
+    return Suite(
+        name=path.stem,
+        title=data["title"],
+        note=data.get("note", ""),
+        algorithms=list(dict.fromkeys(a for part in parts for a in part.algorithms)),
+        environments=list(dict.fromkeys(e for part in parts for e in part.environments)),
+        runs=runs,
+        figures={k: v for part in parts for k, v in part.figures.items()},
+        sweeps={k: v for part in parts for k, v in part.sweeps.items()},
+    )
+
+
+def _scaled(
+    data: dict[str, Any],
+    total_timesteps: int | None,
+    seeds: int | None,
+    agents: int | None,
+    env: tuple[str, ...],
+) -> dict[str, Any]:
+    more = range(max(data["seeds"]) + 1, max(data["seeds"]) + 1 + (seeds or 0))
+    steps = {"total_timesteps": total_timesteps} if total_timesteps else {}
+    return {
         **data,
-        "seeds": data["seeds"][:seeds],
+        "seeds": [*data["seeds"], *more][:seeds] if seeds else data["seeds"],
         "agents": agents or data["agents"],
-        "args": {
-            **data["args"],
-            "total_timesteps": total_timesteps or data["args"]["total_timesteps"],
-        },
+        "args": {**data["args"], **steps},
         "environments": {k: v for k, v in data["environments"].items() if k in env or not env},
+        "all_environments": set(data["environments"]),
     }
+
+
+def _own_runs(path: Path, data: dict[str, Any]) -> Suite:
+    """What a file says itself, without what it includes."""
     sweeps = _sweeps(data, path)
     algorithms = [*data["algorithms"], *(a for made in sweeps.values() for a in made.values())]
     for algorithm in algorithms:
-        _check_keys(algorithm, {"name", "baseline"}, ALGORITHM_KEYS, f"{path.name}: algorithm")
-        _known(dict.fromkeys(algorithm.get("environments", ())), set(data["environments"]),
+        check_keys(algorithm, {"name", "baseline"}, ALGORITHM_KEYS, f"{path.name}: algorithm")
+        known(dict.fromkeys(algorithm.get("environments", ())), data["all_environments"],
                f"{path.name}: {algorithm['name']}: environment")  # fmt: skip
-    runs = [run for algorithm in algorithms for run in _runs(algorithm, scaled, path)]
-    if not runs:
-        raise SuiteError(f"{path.name} has no runs: it needs algorithms, environments and seeds")
+    for title, named in data.get("figures", {}).items():
+        if not fits(named, tuple[str, ...]):
+            raise SuiteError(f"{path.name}: figure {title!r} must list algorithms, got {named!r}")
+        known(dict.fromkeys(named), {a["name"] for a in algorithms}, f"{path.name}: algorithm")
+    runs = [run for algorithm in algorithms for run in _runs(algorithm, data, path)]
     if len({run.run_id for run in runs}) < len(runs):
         raise SuiteError(f"{path.name}: names of algorithms and seeds must differ from each other")
-    for title, named in data.get("figures", {}).items():
-        if not _fits(named, tuple[str, ...]):
-            raise SuiteError(f"{path.name}: figure {title!r} must list algorithms, got {named!r}")
-        _known(dict.fromkeys(named), {a["name"] for a in algorithms}, f"{path.name}: algorithm")
     return Suite(
         name=path.stem,
         title=data["title"],
         note=data.get("note", ""),
         algorithms=[algorithm["name"] for algorithm in algorithms],
-        environments=list(scaled["environments"]),
+        environments=list(data["environments"]),
         runs=runs,
         figures=data.get("figures", {}),
         sweeps={k: {v: a["name"] for v, a in made.items()} for k, made in sweeps.items()},
     )
-
-
-def _read(name: str) -> tuple[Path, dict[str, Any]]:
-    """A suite's file, its keys and their types checked."""
-    path = Path(name) if name.endswith(".toml") else SUITES / f"{name}.toml"
-    if not path.exists():
-        known = f"there are {', '.join(suite_names())}"
-        raise SuiteError(f"no file {name}" if path == Path(name) else f"no suite {name!r}: {known}")
-    try:
-        data = tomllib.loads(path.read_text())
-    except tomllib.TOMLDecodeError as error:
-        raise SuiteError(f"{path} is not valid TOML: {error}") from error
-    _check_keys(data, REQUIRED, KEYS, path.name)
-    for key, hint in (("seeds", tuple[int, ...]), ("agents", int), ("args", dict)):
-        if not _fits(data[key], hint):
-            raise SuiteError(f"{path.name}: {key} must be of type {hint}, got {data[key]!r}")
-    if "total_timesteps" not in data["args"]:
-        raise SuiteError(f"{path.name}: args needs total_timesteps")
-    return path, data
 
 
 def _runs(algorithm: dict[str, Any], data: dict[str, Any], path: Path) -> list[RunSpec]:
@@ -196,6 +197,7 @@ def _runs(algorithm: dict[str, Any], data: dict[str, Any], path: Path) -> list[R
                 environment=environment,
                 baseline=algorithm["baseline"],
                 args={**args, "seed": seed, "agent": agent},
+                evaluation=data.get("evaluation", {}),
             )
             for seed in data["seeds"]
             for agent in range(data["agents"])
@@ -208,7 +210,7 @@ def _sweeps(data: dict[str, Any], path: Path) -> dict[str, dict[Any, dict[str, A
     made = {}
     for sweep in data.get("sweeps", []):
         needed = {"name", "baseline", "parameter", "values"}
-        _check_keys(sweep, needed, SWEEP_KEYS, f"{path.name}: sweep")
+        check_keys(sweep, needed, SWEEP_KEYS, f"{path.name}: sweep")
         where, values = f"{path.name}: sweep {sweep['name']}", sweep["values"]
         if not isinstance(values, list) or any(isinstance(value, list | dict) for value in values):
             raise SuiteError(f"{where}: values must be a list of plain values, got {values!r}")
@@ -224,48 +226,3 @@ def _sweeps(data: dict[str, Any], path: Path) -> dict[str, dict[Any, dict[str, A
             for value in values
         }
     return made
-
-
-def _check_keys(given: dict[str, Any], needed: set[str], known: set[str], where: str) -> None:
-    _known(given, known, f"{where}: key")
-    for key in sorted(needed - set(given)):
-        raise SuiteError(f"{where} needs the key {key!r}")
-
-
-def check_args(baseline: str, args: dict[str, Any], where: str) -> None:
-    """Raise SuiteError unless the baseline takes these arguments and the environment exists."""
-    try:
-        cls = importlib.import_module(f"baselines.{baseline}").Args
-    except ModuleNotFoundError as error:
-        raise SuiteError(f"{where}: baseline {baseline!r} cannot be imported: {error}") from error
-    hints = typing.get_type_hints(cls)
-    _known(args, set(hints), f"{where}: argument")
-    for name, value in args.items():
-        if not _fits(value, hints[name]):
-            raise SuiteError(f"{where}: {name} must be {hints[name]}, got {value!r}")
-    try:
-        cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in args.items()})
-        importlib.import_module("pybullet_envs_gymnasium")  # registers its tasks
-        gym.spec(args["env_id"])
-    except (ValueError, gym.error.Error, ModuleNotFoundError) as error:
-        raise SuiteError(f"{where}: {error}") from error
-
-
-def _known(given: dict[str, Any], known: set[str], what: str) -> None:
-    for name in given:
-        if name not in known:
-            close = difflib.get_close_matches(name, known, n=1) or sorted(known)
-            raise SuiteError(f"{what} {name!r} is unknown: {' or '.join(close)}?")
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    origin = typing.get_origin(hint)
-    if origin in (types.UnionType, typing.Union):
-        return any(_fits(value, option) for option in typing.get_args(hint))
-    if origin is typing.Literal:
-        return value in typing.get_args(hint)
-    if origin is tuple:  # TOML knows lists only
-        return isinstance(value, list) and all(_fits(x, typing.get_args(hint)[0]) for x in value)
-    if hint is float:
-        return isinstance(value, int | float) and not isinstance(value, bool)
-    return type(value) is hint

@@ -1,14 +1,15 @@
-"""Runs side by side on this machine, each a process of its own with one thread."""
+"""Runs side by side on this machine, each a process of its own with its share of the cores."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -34,14 +35,31 @@ class Outcome:
 class _Child:
     spec: RunSpec
     process: subprocess.Popen[bytes]
+    then: list[list[str]]
+    """commands that follow, each if the one before it succeeds"""
+    start: Callable[[list[str]], subprocess.Popen[bytes]]
     resources: contextlib.ExitStack
     started: float
 
+    def ended(self) -> bool:
+        """Whether the last of its commands has ended, or one has failed; begins the next."""
+        if self.process.poll() is None:
+            return False
+        if self.process.returncode or not self.then:
+            return True
+        self.process = self.start(self.then.pop(0))
+        return False
 
-def command(spec: RunSpec, store: Store) -> list[str]:
-    """What runs it, in the checkout's folder; a person can type it too."""
-    flags = [*spec.flags, "--run-dir", str(store.path(spec).resolve()), "--resume"]
-    return [sys.executable, "-m", f"baselines.{spec.baseline}", *flags]
+
+def commands(spec: RunSpec, store: Store) -> list[list[str]]:
+    """What runs it, one after the other, in the checkout's folder; a person can type it too."""
+    path = str(store.path(spec).resolve())
+    train = [f"baselines.{spec.baseline}", *spec.flags, "--run-dir", path, "--resume"]
+    made = [[sys.executable, "-m", *train]]
+    if spec.evaluation:
+        flags = [word for name, x in spec.evaluation.items() for word in (f"--{name}", str(x))]
+        made.append([sys.executable, "-m", "harness", "evaluate", path, *flags])
+    return made
 
 
 def run_local(specs: list[RunSpec], store: Store, jobs: int, progress: Progress) -> Outcome:
@@ -54,7 +72,7 @@ def run_local(specs: list[RunSpec], store: Store, jobs: int, progress: Progress)
         while waiting or children:
             while waiting and len(children) < jobs:
                 spec = waiting.popleft()
-                child = _start(spec, store)
+                child = _start(spec, store, max(1, (os.cpu_count() or 1) // jobs))
                 if child is not None:
                     children.append(child)
                 elif store.is_done(spec):
@@ -63,7 +81,7 @@ def run_local(specs: list[RunSpec], store: Store, jobs: int, progress: Progress)
                 else:
                     outcome.held.append(spec)
                     progress.ended(spec, "being run by another process")
-            for child in [c for c in children if c.process.poll() is not None]:
+            for child in [c for c in children if c.ended()]:
                 children.remove(child)
                 seconds = time.monotonic() - child.started
                 store.finish(child.spec, child.process.returncode, seconds)
@@ -76,25 +94,25 @@ def run_local(specs: list[RunSpec], store: Store, jobs: int, progress: Progress)
     return outcome
 
 
-def _start(spec: RunSpec, store: Store) -> _Child | None:
+def _start(spec: RunSpec, store: Store, threads: int) -> _Child | None:
     with contextlib.ExitStack() as stack:
         lock = stack.enter_context(store.lock(spec))
         if lock is None or store.is_done(spec):  # by another launcher since the plan was made
             return None
-        words = command(spec, store)
-        store.start(spec, words)
+        first, *then = commands(spec, store)
+        store.start(spec, first)
         log = stack.enter_context(open(store.path(spec, "log.txt"), "ab"))
-        process = subprocess.Popen(
-            words,
+        start = functools.partial(
+            subprocess.Popen[bytes],
             cwd=ROOT,
-            env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"},
+            env={**os.environ, "OMP_NUM_THREADS": str(threads), "PYTHONUNBUFFERED": "1"},
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=subprocess.STDOUT,
             start_new_session=True,  # Ctrl-C is for run-all, which stops them in turn
             pass_fds=[lock],
         )
-        return _Child(spec, process, stack.pop_all(), time.monotonic())
+        return _Child(spec, start(first), then, start, stack.pop_all(), time.monotonic())
 
 
 @contextlib.contextmanager

@@ -10,7 +10,7 @@ import pytest
 
 from harness import cli
 from harness.launchers.local import ROOT
-from harness.suite import suite_names
+from harness.schema import suite_names
 from tests.harness.conftest import write_run
 
 

@@ -9,7 +9,8 @@ import pytest
 import tyro
 
 from harness.statistics import MIN_AGENTS
-from harness.suite import SuiteError, load_suite, suite_names
+from harness.schema import SuiteError, suite_names
+from harness.suite import load_suite
 
 
 def test_every_algorithm_task_seed_and_agent_is_a_run(suite):

@@ -1,0 +1,190 @@
+"""Generalization of a CoinRun agent: every level it was trained on, and as many it never saw.
+
+Each level is played in a pool of its own (`num_levels=1`), so all count equally, and of each
+environment only the first episode counts, so short episodes do not count more often. A level is
+determined by its seed and the actions: sampled actions are repeated, greedy ones played once.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import torch
+from gymnasium.vector import VectorEnv
+from PIL import Image
+
+from baselines.ppo_reg_coinrun import Agent, Args, RunError, find_device, make_env, play
+from harness.store import EvaluationError, read_json, write_json
+
+POOLS = 16  # levels played at a time
+MAX_SEED = 2**31 - 1
+COLUMNS = ["split", "level", "policy", "repeat", "success", "return", "length"]
+GIF_FRAMES, GIF_ZOOM = 300, 4
+
+
+class Levels(VectorEnv):
+    """Several levels side by side, `repeats` environments each, in the order of `levels`."""
+
+    def __init__(self, args: Args, levels: list[int], repeats: int) -> None:
+        one = dataclasses.replace(args, num_levels=1)
+        self.envs = [make_env(one, repeats, level) for level in levels]
+        self.num_envs = len(levels) * repeats
+        self.metadata = self.envs[0].metadata
+        self.single_observation_space = self.envs[0].single_observation_space
+        self.single_action_space = self.envs[0].single_action_space
+        self.observation_space = gym.vector.utils.batch_space(
+            self.single_observation_space, self.num_envs
+        )
+        self.action_space = gym.vector.utils.batch_space(self.single_action_space, self.num_envs)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple:
+        super().reset(seed=seed)
+        seeds = self.np_random.integers(2**31, size=len(self.envs)).tolist()
+        frames = [env.reset(seed=s)[0] for env, s in zip(self.envs, seeds, strict=True)]
+        return np.concatenate(frames), {}
+
+    def step(self, actions: np.ndarray) -> tuple:
+        for env, chosen in zip(self.envs, np.split(actions, len(self.envs)), strict=True):
+            env.step_async(chosen)
+        *results, infos = zip(*(env.step_wait() for env in self.envs), strict=True)
+        return *map(np.concatenate, results), self._join(infos)
+
+    def _join(self, infos: tuple[dict[str, Any], ...]) -> dict[str, Any]:
+        ended = [i for i in infos if "episode" in i]
+        if not ended:
+            return {}
+        none = np.zeros(self.num_envs // len(self.envs))
+
+        def join(read: Callable[[dict[str, Any]], np.ndarray]) -> np.ndarray:
+            return np.concatenate([read(i) if "episode" in i else none for i in infos])
+
+        return {
+            "episode": {name: join(lambda i, n=name: i["episode"][n]) for name in ("r", "l")},
+            **{name: join(lambda i, n=name: i[n]) for name in ("success", "level_seed")},
+            "_episode": join(lambda i: i["_episode"]).astype(bool),
+        }
+
+    def close_extras(self, **kwargs: Any) -> None:
+        for env in self.envs:
+            env.close()
+
+
+def choose_levels(args: Args, count: int, unseen: str, seed: int = 0) -> dict[str, list[int]]:
+    """`count` levels of the training set, evenly spaced, and `count` that are not in it.
+
+    Args:
+        args: Of the training run.
+        count: Levels of each split.
+        unseen: "next", the levels after the training set, or "unbounded", seeds drawn at random.
+        seed: Of the random draw.
+    """
+    if args.num_levels == 0:
+        raise EvaluationError("the agent was trained on levels without bound: none is unseen")
+    if not 1 <= count <= args.num_levels:
+        raise EvaluationError(f"levels must be from 1 to {args.num_levels}, got {count}")
+    seen = [args.start_level + i * args.num_levels // count for i in range(count)]
+    trained = range(args.start_level, args.start_level + args.num_levels)
+    if unseen == "next":
+        fresh = [trained.stop + i * args.num_levels // count for i in range(count)]
+    elif unseen == "unbounded":
+        drawn = np.random.default_rng(seed).choice(MAX_SEED, 2 * count + args.num_levels, False)
+        fresh = [int(level) for level in drawn if level not in trained][:count]
+    else:
+        raise EvaluationError(f"unseen must be next or unbounded, got {unseen!r}")
+    if set(fresh) & set(trained):
+        raise AssertionError("an unseen level was trained on")
+    return {"seen": seen, "unseen": fresh}
+
+
+def evaluate_levels(
+    agent: Agent, args: Args, levels: list[int], repeats: int, seed: int = 0
+) -> Iterator[pd.DataFrame]:
+    """Episodes of some levels at a time: `repeats` with sampled actions each, and a greedy one."""
+    for first in range(0, len(levels), POOLS):
+        some = levels[first : first + POOLS]
+        for policy, times in (("sampled", repeats), ("greedy", 1)):
+            env = Levels(args, some, times)
+            rng = torch.Generator().manual_seed(seed + first) if policy == "sampled" else None
+            found = play(agent, env, seed + first, rng)
+            env.close()
+            level = np.repeat(some, times)
+            if not np.array_equal(found.pop("level_seed"), level):
+                raise AssertionError("the engine played other levels than it was asked for")
+            places = {"level": level, "repeat": np.tile(np.arange(times), len(some))}
+            yield pd.DataFrame({**places, "policy": policy, **found})
+
+
+def evaluate_run(
+    path: Path, levels: int, repeats: int, unseen: str, device: str,
+    show: Callable[[Iterable, int], Iterable] = lambda parts, total: parts,
+) -> pd.DataFrame:  # fmt: skip
+    """Evaluate a run's checkpoint, once: a row for each episode, kept as evaluation.csv.
+
+    Beside it come evaluation.json, which tells when it is out of date, and seen.gif and unseen.gif.
+    """
+    if repeats < 1:
+        raise EvaluationError(f"repeats must be at least 1, got {repeats}")
+    try:
+        content = (path / "checkpoint.pt").read_bytes()
+    except FileNotFoundError:
+        raise EvaluationError(f"{path} holds no checkpoint.pt: train it first") from None
+    about = {"levels": levels, "repeats": repeats, "unseen": unseen}
+    about["checkpoint_sha256"] = hashlib.sha256(content).hexdigest()
+    if read_json(path / "evaluation.json") == about:
+        return pd.read_csv(path / "evaluation.csv")
+    agent, args = load_agent(path / "checkpoint.pt", device)
+    chosen = choose_levels(args, levels, unseen)
+    jobs = ((split, part) for split, some in chosen.items()
+            for part in evaluate_levels(agent, args, some, repeats))  # fmt: skip
+    parts = [part.assign(split=split) for split, part in show(jobs, 4 * -(-levels // POOLS))]
+    for split, some in chosen.items():
+        record(agent, args, some[0], path / f"{split}.gif")
+    episodes = pd.concat(parts)[COLUMNS].sort_values(COLUMNS[:4], ignore_index=True)
+    episodes = episodes.astype({"success": int})
+    (path / "evaluation.json").unlink(missing_ok=True)
+    episodes.to_csv(path / "evaluation.csv.tmp", index=False)
+    (path / "evaluation.csv.tmp").replace(path / "evaluation.csv")
+    write_json(path / "evaluation.json", about)
+    return episodes
+
+
+def load_agent(checkpoint: Path, device: str) -> tuple[Agent, Args]:
+    """The agent of a checkpoint, and the settings that it was trained with."""
+    try:
+        saved = torch.load(checkpoint, map_location="cpu", weights_only=True)
+        args = Args(**saved["args"] | {"device": device})
+    except TypeError:
+        raise EvaluationError(f"{checkpoint} is not of ppo_reg_coinrun") from None
+    except Exception as error:  # whatever a torn file makes the reader stumble over
+        raise EvaluationError(f"{checkpoint} cannot be read: {error!r}") from error
+    try:
+        agent = Agent(args, torch.Generator()).to(find_device(device))
+    except RunError as error:
+        raise EvaluationError(str(error)) from None
+    agent.load_state_dict(saved["learner"]["agent"])
+    return agent, args
+
+
+def record(agent: Agent, args: Args, level: int, path: Path) -> None:
+    """The greedy agent's episode on a level, as an animated GIF."""
+    env = Levels(args, [level], 1)
+    frames, pictures, device = env.reset(seed=0)[0], [], agent.mask.device
+    agent.eval()
+    while len(pictures) < GIF_FRAMES:
+        size = (GIF_ZOOM * 64, GIF_ZOOM * 64)
+        image = Image.fromarray(frames[0].transpose(1, 2, 0))
+        pictures.append(image.resize(size, Image.Resampling.NEAREST))
+        with torch.no_grad():
+            actions = agent(torch.tensor(frames, device=device))[0].argmax(-1).cpu().numpy()
+        frames, _, ended, cut, _ = env.step(actions)
+        if (ended | cut).any():
+            break
+    env.close()
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=67, loop=0)
