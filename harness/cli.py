@@ -19,7 +19,6 @@ from rich.table import Table
 
 from harness.launchers.local import Outcome, run_local
 from harness.progress import Progress, duration
-from harness.report import table1
 from harness.report.page import write_report
 from harness.report.results import Results, load_results
 from harness.schema import SuiteError, suite_names
@@ -170,10 +169,11 @@ def report(suite: str = DEFAULT_SUITE, results_dir: Path = Path("results")) -> N
 def make_report(results: Results, store: Store) -> None:
     """Print the table and the verdicts, and write the whole report to results/<suite>/report/."""
     folder = store.report_path(results.suite.name)
-    cells, found = write_report(results, folder)
-    console.print(table1.to_rich(results, cells))
-    for note in table1.notes(results, cells):
-        say(f"• {note}", markup=False)
+    sections, found = write_report(results, folder)
+    for section in sections:
+        console.print(section.table)
+        for note in section.notes:
+            say(f"• {note}", markup=False)
     for claim in found:
         say(f"Claim ({claim.letter}): {claim.statement} [bold]{claim.verdict}[/]")
     say(f"Written: {folder / 'report.html'}, with its tables and figures beside it.")

@@ -56,7 +56,7 @@ def read(name: str) -> tuple[Path, dict[str, Any]]:
 
 
 def check_keys(given: dict[str, Any], needed: set[str], known: set[str], where: str) -> None:
-    known(given, known, f"{where}: key")
+    check_known(given, known, f"{where}: key")
     for key in sorted(needed - set(given)):
         raise SuiteError(f"{where} needs the key {key!r}")
 
@@ -70,7 +70,7 @@ def check_args(baseline: str, args: dict[str, Any], where: str) -> None:
         raise SuiteError(f"{where}: baseline {baseline!r} cannot be imported: {error}") from error
     has_games = hasattr(module, "GAMES")  # its own check of env_id
     hints = typing.get_type_hints(cls)
-    known(args, set(hints), f"{where}: argument")
+    check_known(args, set(hints), f"{where}: argument")
     for name, value in args.items():
         if not fits(value, hints[name]):
             raise SuiteError(f"{where}: {name} must be {hints[name]}, got {value!r}")
@@ -83,7 +83,7 @@ def check_args(baseline: str, args: dict[str, Any], where: str) -> None:
         raise SuiteError(f"{where}: {error}") from error
 
 
-def known(given: dict[str, Any], known: set[str], what: str) -> None:
+def check_known(given: dict[str, Any], known: set[str], what: str) -> None:
     for name in given:
         if name not in known:
             close = difflib.get_close_matches(name, known, n=1) or sorted(known)

@@ -10,7 +10,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from harness.schema import SuiteError, check_args, check_keys, fits, known, read
+from harness.schema import SuiteError, check_args, check_keys, check_known, fits, read
 
 ALGORITHM_KEYS = {"name", "baseline", "args", "environments"}
 SWEEP_KEYS = ALGORITHM_KEYS | {"parameter", "values"}
@@ -113,10 +113,12 @@ def load_suite(
             raise SuiteError(f"{path.name} includes {other.stem}, which has no runs of its own")
     files = [(p, d) for p, d in [(path, data), *included] if "algorithms" in d]
     there = {environment for _, d in files for environment in d["environments"]}
-    known(dict.fromkeys(env), there, "environment")
+    check_known(dict.fromkeys(env), there, "environment")
     parts = [_own_runs(p, _scaled(d, total_timesteps, seeds, agents, env)) for p, d in files]
-    runs = {run.hash: run for part in reversed(parts) for run in reversed(part.runs)}
-    runs = list(reversed(runs.values()))  # one that several suites have is run once, by the first
+    found: dict[tuple[str, ...], RunSpec] = {}
+    for run in (run for part in parts for run in part.runs):
+        found.setdefault((run.algorithm, run.environment, run.hash), run)
+    runs = list(found.values())  # what several suites have is run once, by the first of them
     if not runs:
         raise SuiteError(f"{path.name} has no runs: it needs algorithms, environments and seeds")
     cells = {(r.algorithm, r.environment, r.args["seed"], r.args["agent"]) for r in runs}
@@ -159,12 +161,14 @@ def _own_runs(path: Path, data: dict[str, Any]) -> Suite:
     algorithms = [*data["algorithms"], *(a for made in sweeps.values() for a in made.values())]
     for algorithm in algorithms:
         check_keys(algorithm, {"name", "baseline"}, ALGORITHM_KEYS, f"{path.name}: algorithm")
-        known(dict.fromkeys(algorithm.get("environments", ())), data["all_environments"],
+        check_known(dict.fromkeys(algorithm.get("environments", ())), data["all_environments"],
                f"{path.name}: {algorithm['name']}: environment")  # fmt: skip
     for title, named in data.get("figures", {}).items():
         if not fits(named, tuple[str, ...]):
             raise SuiteError(f"{path.name}: figure {title!r} must list algorithms, got {named!r}")
-        known(dict.fromkeys(named), {a["name"] for a in algorithms}, f"{path.name}: algorithm")
+        check_known(
+            dict.fromkeys(named), {a["name"] for a in algorithms}, f"{path.name}: algorithm"
+        )
     runs = [run for algorithm in algorithms for run in _runs(algorithm, data, path)]
     if len({run.run_id for run in runs}) < len(runs):
         raise SuiteError(f"{path.name}: names of algorithms and seeds must differ from each other")

@@ -52,7 +52,7 @@ def learning_curves(results: Results, algorithms: list[str], path: Path) -> None
             axis.set_visible(True)
             tidy(axis)
             for algorithm, color in zip(algorithms, itertools.cycle(COLORS), strict=False):
-                _draw(axis, results.curves(task, algorithm, measure), algorithm, color)
+                draw_curves(axis, results.curves(task, algorithm, measure), algorithm, color)
             axis.set_ylabel(label if column == 0 else "")
             axis.set_title(task if j == 0 else "", fontsize=11)
             axis.set_xlabel("environment steps" if j and i + columns >= len(tasks) else "")
@@ -60,7 +60,7 @@ def learning_curves(results: Results, algorithms: list[str], path: Path) -> None
     save(figure, path)
 
 
-def _draw(axis: Axes, curves: pd.DataFrame, label: str, color: str) -> None:
+def draw_curves(axis: Axes, curves: pd.DataFrame, label: str, color: str) -> None:
     if curves.empty:
         return
     every = -(-len(curves) // POINTS)  # a point is the mean of so many updates

@@ -2,36 +2,95 @@
 
 from __future__ import annotations
 
+import dataclasses
+import os
 from pathlib import Path
 
 import jinja2
+from rich.table import Table
 
-from harness.report import claims, figures, study, table1
+from harness.report import claims, figures, study, table1, table2
 from harness.report.results import Results
 from harness.statistics import MIN_AGENTS
 
 
-def write_report(results: Results, folder: Path) -> tuple[list[table1.Cell], list[claims.Claim]]:
+@dataclasses.dataclass(frozen=True)
+class Section:
+    """One table of the paper beside ours, with its notes and figures."""
+
+    title: str
+    header: list[str]
+    rows: list[list[str]]
+    notes: list[str]
+    pictures: list[tuple[str, str]]
+    """a title and a file's name"""
+    table: Table
+    """the same table for a terminal"""
+
+
+def write_report(results: Results, folder: Path) -> tuple[list[Section], list[claims.Claim]]:
     """Write report.html, the tables as Markdown and CSV, and the figures as PNG, to a folder."""
-    cells, found = table1.make_cells(results), claims.make_claims(results)
-    (folder / "table1.md").write_text(table1.to_markdown(results, cells))
-    table1.to_frame(cells).to_csv(folder / "table1.csv", index=False)
+    control, levels = results.part(evaluated=False), results.part(evaluated=True)
+    found, sections = [], []
+    if control.suite.runs:
+        found += claims.make_claims(control)
+        sections.append(_control(control, found, folder))
+    if levels.suite.runs:
+        found.append(table2.generalization_claim(levels))
+        sections.append(_levels(levels, found[-1], folder))
     claims.to_frame(found).to_csv(folder / "claims.csv", index=False)
-    header, rows = table1.to_rows(results.suite, cells)
     page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(
         (Path(__file__).parent / "page.html").read_text()
     )
     content = page.render(
-        suite=results.suite, claims=found, header=header, rows=rows, min_agents=MIN_AGENTS,
-        min_updates=claims.MIN_UPDATES,
-        notes=table1.notes(results, cells), pictures=_draw(results, found, folder),
+        suite=results.suite, claims=found, sections=sections, min_agents=MIN_AGENTS,
+        min_updates=claims.MIN_UPDATES, episodes=_episodes(levels, folder),
     )  # fmt: skip
     (folder / "report.html").write_text(content)
-    return cells, found
+    return sections, found
+
+
+def _control(results: Results, found: list[claims.Claim], folder: Path) -> Section:
+    cells = table1.make_cells(results)
+    (folder / "table1.md").write_text(table1.to_markdown(results, cells))
+    table1.to_frame(cells).to_csv(folder / "table1.csv", index=False)
+    header, rows = table1.to_rows(results.suite, cells)
+    return Section(
+        "Table 1: mean reward over the last 100 updates, beside the paper's", header, rows,
+        table1.notes(results, cells), _draw(results, found, folder), table1.to_rich(results, cells),
+    )  # fmt: skip
+
+
+def _levels(results: Results, claim: claims.Claim, folder: Path) -> Section:
+    cells = table2.make_cells(results)
+    (folder / "table2.md").write_text(table2.to_markdown(results, cells))
+    table2.to_frame(cells).to_csv(folder / "table2.csv", index=False)
+    header, rows = table2.to_rows(results, cells)
+    pictures = []
+    if results.metrics:
+        title = "Figure 4: success on seen and unseen levels during training"
+        pictures.append((title, "figure4.png"))
+        table2.success_curves(results, folder / "figure4.png")
+    pictures.append(("Claim (d), number by number", "claim_d.png"))
+    study.findings(claim, folder / "claim_d.png")
+    return Section(
+        "Table 2: success rate on CoinRun levels, %, beside the paper's", header, rows,
+        table2.notes(results, cells), pictures, table2.to_rich(results, cells),
+    )  # fmt: skip
+
+
+def _episodes(results: Results, folder: Path) -> list[tuple[str, list[str]]]:
+    """GIFs of each algorithm's first agent, on a seen and on an unseen level, if recorded."""
+    shown: dict[str, list[str]] = {}
+    for run in results.suite.runs:
+        gifs = [results.folders[run.run_id] / f"{split}.gif" for split in table2.SPLITS]
+        if run.algorithm not in shown and all(gif.exists() for gif in gifs):
+            shown[run.algorithm] = [os.path.relpath(gif, folder) for gif in gifs]
+    return list(shown.items())
 
 
 def _draw(results: Results, found: list[claims.Claim], folder: Path) -> list[tuple[str, str]]:
-    """Every figure that the suite's runs allow: its title and its file's name."""
+    """Every figure that the control runs allow: its title and its file's name."""
     pictures = []
     for i, (title, algorithms) in enumerate(results.suite.figures.items(), 1):
         pictures.append((title, f"learning_curves_{i}.png"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import pandas as pd
 
@@ -20,6 +21,38 @@ class Results:
     """ids of runs that were made by another configuration: left out"""
     done: list[str]
     """ids of runs that are complete"""
+    evaluations: dict[str, pd.DataFrame]
+    """episodes on seen and unseen levels, by run id, of the runs that were evaluated"""
+    folders: dict[str, Path]
+    """where each run's files are, by run id"""
+
+    def part(self, evaluated: bool) -> Results:
+        """The runs that are evaluated on levels, or the others: the control tasks."""
+        runs = [run for run in self.suite.runs if bool(run.evaluation) == evaluated]
+        named = {run.algorithm for run in runs}
+        tasks = {run.environment for run in runs}
+        suite = dataclasses.replace(
+            self.suite,
+            runs=runs,
+            algorithms=[name for name in self.suite.algorithms if name in named],
+            environments=[task for task in self.suite.environments if task in tasks],
+        )
+        return dataclasses.replace(self, suite=suite)
+
+    def evaluations_of(self, environment: str, algorithm: str) -> dict[str, pd.DataFrame]:
+        """The evaluated episodes of one algorithm's agents, by run id."""
+        return {
+            run.run_id: self.evaluations[run.run_id]
+            for run in self.suite.runs
+            if (run.environment, run.algorithm) == (environment, algorithm)
+            and run.run_id in self.evaluations
+        }
+
+    def pairs(self, environment: str, algorithm: str) -> dict[tuple[int, int], pd.DataFrame]:
+        """The same, by (seed, agent)."""
+        key = {run.run_id: (run.args["seed"], run.args["agent"]) for run in self.suite.runs}
+        found = self.evaluations_of(environment, algorithm)
+        return {key[run_id]: episodes for run_id, episodes in found.items()}
 
     def of(self, environment: str, algorithm: str) -> dict[str, pd.DataFrame]:
         """The metrics of one algorithm's agents on one environment, by run id."""
@@ -38,11 +71,15 @@ class Results:
 
 def load_results(suite: Suite, store: Store) -> Results:
     """Read what there is; runs may be unfinished, or still be running."""
-    metrics, changed, done = {}, [], []
+    metrics, changed, done, evaluations = {}, [], [], {}
     for run in suite.runs:
         if store.changes(run):
             changed.append(run.run_id)
         elif (found := store.metrics(run)) is not None:
             metrics[run.run_id] = found
-            done += [run.run_id] if store.is_done(run) else []
-    return Results(suite, metrics, changed, done)
+            if store.is_done(run):
+                done.append(run.run_id)
+                if run.evaluation:
+                    evaluations[run.run_id] = pd.read_csv(store.path(run, "evaluation.csv"))
+    folders = {run.run_id: store.path(run) for run in suite.runs}
+    return Results(suite, metrics, changed, done, evaluations, folders)

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import tomllib
 from collections.abc import Iterable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 from rich.table import Table
 
+from harness.report.markdown import to_markdown_table
+from harness.report.paper import paper_numbers
 from harness.report.results import Results
 from harness.statistics import LAST_UPDATES, Estimate, estimate_mean, final_score
 from harness.suite import Suite
@@ -45,14 +44,9 @@ class Cell:
         return f"{mean:.1f}" if np.isnan(low) else f"{mean:.1f} [{low:.1f}, {high:.1f}]"
 
 
-def paper_numbers() -> dict[str, Any]:
-    path = Path(__file__).parents[1] / "paper.toml"
-    return tomllib.loads(path.read_text())["table1"]
-
-
 def make_cells(results: Results) -> list[Cell]:
     """A cell for each environment and algorithm, from whatever has been run so far."""
-    suite, paper = results.suite, paper_numbers()
+    suite, paper = results.suite, paper_numbers("table1")
     algorithms = [a for a in suite.algorithms if a in paper] or suite.algorithms
     planned = suite.planned
     seeds = {run.run_id: run.args["seed"] for run in suite.runs}
@@ -81,7 +75,7 @@ def make_cells(results: Results) -> list[Cell]:
 
 def notes(results: Results, cells: list[Cell]) -> list[str]:
     """What a reader must know before comparing."""
-    paper, run = paper_numbers(), [c for c in cells if c.agents]
+    paper, run = paper_numbers("table1"), [c for c in cells if c.agents]
     lines = [results.suite.note] if results.suite.note else []
     if any(c.steps < paper["timesteps"] for c in run):
         lines.append(
@@ -156,6 +150,7 @@ def to_rows(suite: Suite, cells: list[Cell]) -> tuple[list[str], list[list[str]]
 def to_markdown(results: Results, cells: list[Cell]) -> str:
     """The table and its notes, then how much each cell rests on."""
     header, rows = to_rows(results.suite, cells)
+    about = ["task", "algorithm", "agents", "seeds", "steps", "updates"]
     weights = [
         [c.environment, c.algorithm, f"{c.agents} of {c.planned}", str(c.seeds), f"{c.steps:,}",
          str(c.updates)] for c in cells
@@ -164,26 +159,23 @@ def to_markdown(results: Results, cells: list[Cell]) -> str:
         "\n\n".join(
             [
                 f"# {results.suite.title}",
-                f"{paper_numbers()['metric'].capitalize()}.",
-                _markdown(header, rows),
+                f"{paper_numbers('table1')['metric'].capitalize()}.",
+                to_markdown_table(header, rows),
                 "\n".join(f"- {line}" for line in notes(results, cells)),
                 "What each cell rests on:",
-                _markdown(["task", "algorithm", "agents", "seeds", "steps", "updates"], weights),
+                to_markdown_table(about, weights),
             ]
         )
         + "\n"
     )
 
 
-def _markdown(header: list[str], rows: list[list[str]]) -> str:
-    lines = [header, ["---", *["--:"] * (len(header) - 1)], *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
 def to_rich(results: Results, cells: list[Cell]) -> Table:
     """The table for a terminal: the paper's number below ours."""
     header, rows = to_rows(results.suite, cells)
-    table = Table(title=f"{results.suite.name}: {paper_numbers()['metric']}", show_lines=True)
+    table = Table(
+        title=f"{results.suite.name}: {paper_numbers('table1')['metric']}", show_lines=True
+    )
     table.add_column(header[0])
     for name in header[1::2]:
         table.add_column(name, justify="right")

@@ -1,0 +1,212 @@
+"""Table 2, Figure 4 and claim (d): success on CoinRun levels seen and unseen in training."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from rich.table import Table
+
+from harness.report.claims import Claim, Finding, agreed
+from harness.report.figures import COLORS, draw_curves, save, tidy
+from harness.report.markdown import to_markdown_table
+from harness.report.paper import paper_numbers
+from harness.report.results import Results
+from harness.statistics import Estimate, estimate_mean, estimate_success, success_matrix, verdict
+
+SPLITS, POLICIES = ("seen", "unseen"), ("sampled", "greedy")
+STATEMENT = "The regularizer improves all four CoinRun agents, on seen and on unseen levels."
+DEVIATIONS = (
+    "The engine is Procgen's CoinRun (EnvPool's port), hard levels, where the paper has the "
+    "original CoinRun: 15 actions in place of 7, other level generator and visual themes.",
+    "The agent's velocity is painted into the frame, as in the original.",
+    "Unseen levels are those after the training set; Lee et al. draw theirs without bound.",
+    "Repeats are episodes of each level, every level counted equally, first episodes only.",
+    "Dropout in NatureCNN acts on its last hidden layer, with one mask for a rollout and its "
+    "update; the paper does not say where.",
+    "Where delta comes from is not stated in the paper: here a random direction of length 1 over "
+    "pixels in [0, 1]. pi(S) is the log-probabilities.",
+    "Time limits count as ends, as in the original engine. Weights begin orthogonal.",
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """One agent of the paper on one kind of levels."""
+
+    environment: str
+    algorithm: str
+    split: str
+    policy: str
+    estimate: Estimate
+    """success rate in [0, 1]"""
+    levels: int
+    repeats: int
+    planned: int
+    steps: int
+    paper: float | None
+
+    @property
+    def text(self) -> str:
+        mean, low, high, n = self.estimate
+        return f"{100 * mean:.1f} [{100 * low:.1f}, {100 * high:.1f}]" if n else "–"
+
+
+def make_cells(results: Results) -> list[Cell]:
+    """A cell for each agent, kind of levels and kind of actions, from what has been evaluated."""
+    suite, paper, cells = results.suite, paper_numbers("table2"), []
+    for environment, algorithm in itertools.product(suite.environments, suite.algorithms):
+        if not suite.planned[environment, algorithm]:
+            continue
+        found = results.evaluations_of(environment, algorithm)
+        metrics = results.of(environment, algorithm)
+        steps = min((int(m["global_step"].iloc[-1]) for m in metrics.values()), default=0)
+        for policy, split in itertools.product(POLICIES, SPLITS):
+            matrices = [_matrix(episodes, split, policy) for episodes in found.values()]
+            cells.append(
+                Cell(
+                    environment, algorithm, split, policy, estimate_success(matrices),
+                    levels=matrices[0].shape[0] if matrices else 0,
+                    repeats=matrices[0].shape[1] if matrices else 0,
+                    planned=suite.planned[environment, algorithm], steps=steps,
+                    paper=paper[split].get(algorithm) if policy == "sampled" else None,
+                )
+            )  # fmt: skip
+    return cells
+
+
+def _matrix(episodes: pd.DataFrame, split: str, policy: str) -> np.ndarray:
+    chosen = (episodes["split"] == split) & (episodes["policy"] == policy)
+    return success_matrix(episodes[chosen])
+
+
+def notes(results: Results, cells: list[Cell]) -> list[str]:
+    """What a reader must know before comparing, then every deviation from the paper."""
+    paper, run = paper_numbers("table2"), [c for c in cells if c.estimate.n]
+    lines = []
+    if run:
+        first, most = run[0], max(c.estimate.n for c in run)
+        lines += [
+            f"{first.levels} seen and {first.levels} unseen levels, {first.repeats} repeats with "
+            f"sampled actions; greedy actions once, as a level is deterministic. The paper: "
+            f"{paper['levels']} training levels, {paper['repeats']} repeats.",
+            f"Agents in a cell: at most {most}; the paper has {paper['seeds']}. Brackets hold the "
+            "95% interval over levels and repeats, and over agents where there are several: with "
+            "one agent they say nothing of another training run.",
+        ]
+        steps = min(c.steps for c in run)
+        if steps < 0.95 * paper["timesteps"]:
+            lines.append(
+                f"Steps done: {steps:,}; the paper's runs have {paper['timesteps']:,}. Shorter "
+                "runs can neither confirm nor refute it."
+            )
+    missing = sorted({c.algorithm for c in cells if c.estimate.n < c.planned})
+    if missing:
+        lines.append(f"Not all evaluated yet: {', '.join(missing)}.")
+    return lines + list(DEVIATIONS)
+
+
+def to_rows(results: Results, cells: list[Cell]) -> tuple[list[str], list[list[str]]]:
+    """The table as text: a header, and a row for each kind of levels and of actions."""
+    algorithms = [a for a in results.suite.algorithms if any(c.algorithm == a for c in cells)]
+    header = ["levels", *(x for a in algorithms for x in (a, f"{a}, paper"))]
+    found = {(c.policy, c.split, c.algorithm): c for c in cells}
+    rows = []
+    for policy, split in itertools.product(POLICIES, SPLITS):
+        row = [f"{split}, {policy}"]
+        for algorithm in algorithms:
+            cell = found[policy, split, algorithm]
+            row += [cell.text, "" if cell.paper is None else f"{cell.paper:.1f}"]
+        rows.append(row)
+    return header, rows
+
+
+def to_markdown(results: Results, cells: list[Cell]) -> str:
+    header, rows = to_rows(results, cells)
+    lines = "\n".join(f"- {line}" for line in notes(results, cells))
+    table = to_markdown_table(header, rows)
+    return f"# {results.suite.title}\n\nSuccess rate, %.\n\n{table}\n\n{lines}\n"
+
+
+def to_frame(cells: list[Cell]) -> pd.DataFrame:
+    """A row for each cell, for CSV."""
+    rows = [{**dataclasses.asdict(c), **c.estimate._asdict()} for c in cells]
+    return pd.DataFrame(rows).drop(columns="estimate")
+
+
+def to_rich(results: Results, cells: list[Cell]) -> Table:
+    """The table for a terminal, an agent to a line."""
+    header, rows = to_rows(results, cells)
+    table = Table(title=f"{results.suite.name}: success rate on CoinRun levels, %")
+    table.add_column("agent")
+    for row in rows:
+        table.add_column(row[0], justify="right")
+    for i, name in enumerate(header[1::2]):
+        texts = []
+        for row in rows:
+            ours, paper = row[1 + 2 * i], row[2 + 2 * i]
+            texts.append(f"{ours}\n[dim]paper {paper}[/]" if paper else ours)
+        table.add_row(name, *texts)
+    return table
+
+
+def generalization_claim(results: Results) -> Claim:
+    """Claim (d): for each agent and kind of levels, reg minus plain, paired by seed and agent."""
+    findings = []
+    for environment, plain in itertools.product(results.suite.environments, _plain(results)):
+        rates = {
+            name: {key: _rates(e) for key, e in results.pairs(environment, name).items()}
+            for name in (plain, f"{plain} reg")
+        }
+        both = rates[plain].keys() & rates[f"{plain} reg"].keys()
+        for split in SPLITS:
+            gains = [rates[f"{plain} reg"][k][split] - rates[plain][k][split] for k in sorted(both)]
+            estimate = estimate_mean(np.array(gains))
+            about = f"{plain} reg - {plain}: success, {split} levels"
+            findings.append(Finding(about, environment, estimate, verdict(estimate, +1)))
+    return Claim("d", STATEMENT, agreed([f.verdict for f in findings]), findings)
+
+
+def _plain(results: Results) -> list[str]:
+    names = results.suite.algorithms
+    return [name for name in names if f"{name} reg" in names]
+
+
+def _rates(episodes: pd.DataFrame) -> dict[str, float]:
+    return {split: float(_matrix(episodes, split, "sampled").mean()) for split in SPLITS}
+
+
+def success_curves(results: Results, path: Path) -> None:
+    """Figure 4: success on seen and unseen levels, and psi, a column for each pair of agents."""
+    pairs = _plain(results)
+    measures = (("eval/success_seen", "success, seen"), ("eval/success_unseen", "success, unseen"))
+    measures += (("conditioning/psi", "psi"),)
+    figure, axes = plt.subplots(
+        3, len(pairs), figsize=(3.4 * len(pairs), 6.5), squeeze=False, sharex=True, sharey="row",
+        layout="constrained",
+    )  # fmt: skip
+    environment = results.suite.environments[0]
+    for column, plain in enumerate(pairs):
+        for row, (measure, label) in enumerate(measures):
+            axis: Any = axes[row, column]
+            tidy(axis)
+            for name, color, kind in zip((plain, f"{plain} reg"), COLORS, ("plain", "reg"),
+                                         strict=False):  # fmt: skip
+                draw_curves(axis, _by_update(results, environment, name, measure), kind, color)
+            axis.set_title(plain if row == 0 else "", fontsize=11)
+            axis.set_ylabel(label if column == 0 else "")
+        axes[-1, column].set_xlabel("environment steps")
+    save(figure, path)
+
+
+def _by_update(results: Results, environment: str, name: str, measure: str) -> pd.DataFrame:
+    """Agents count their steps differently by a few, so curves are joined by update."""
+    found = results.of(environment, name)
+    curves = pd.DataFrame({k: m[measure] for k, m in found.items()})
+    steps = pd.DataFrame({k: m["global_step"] for k, m in found.items()}).mean(axis=1)
+    return curves.set_index(steps).dropna(how="all") if len(curves) else curves
