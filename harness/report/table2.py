@@ -198,6 +198,8 @@ def success_curves(results: Results, path: Path) -> None:
             for name, color, kind in zip((plain, f"{plain} reg"), COLORS, ("plain", "reg"),
                                          strict=False):  # fmt: skip
                 draw_curves(axis, _by_update(results, environment, name, measure), kind, color)
+            if measure.startswith("eval"):
+                axis.set_ylim(-0.03, 1.03)
             axis.set_title(plain if row == 0 else "", fontsize=11)
             axis.set_ylabel(label if column == 0 else "")
         axes[-1, column].set_xlabel("environment steps")
