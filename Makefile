@@ -9,7 +9,7 @@ INSTALLED := .venv/installed
 help:  ## what each target does
 	@sed -n 's/^\([a-z]*\):.*##/\1\t/p' Makefile | expand -t 10
 
-run: $(INSTALLED)  ## the main job: PPO with and without the regularizer on 8 tasks, then a table
+run: $(INSTALLED)  ## the main job: every agent of the paper at toy length, then the report
 	$(BIN)/python -m harness run-all --suite smoke
 	@echo "Look at results/smoke/report/report.html"
 
@@ -42,7 +42,7 @@ $(INSTALLED): requirements.lock pyproject.toml
 lock:  ## write requirements.lock anew, from the newest versions that fit
 	rm -rf .venv-lock && $(PYTHON) -m venv .venv-lock
 	.venv-lock/bin/pip install --quiet torch==2.13.0 hatchling editables
-	.venv-lock/bin/pip install --quiet '.[harness,bullet,video,dev]'
+	.venv-lock/bin/pip install --quiet '.[harness,bullet,coinrun,video,dev]'
 	echo '# Exact versions for Python 3.11 of all extras but wandb, written by `make lock`.' > requirements.lock
 	.venv-lock/bin/pip freeze --all | grep -v '^pip==\|^condwrap' | sed 's/+cpu//' >> requirements.lock
 	rm -rf .venv-lock
