@@ -399,6 +399,8 @@ def load_qt() -> None:
                 "EnvPool needs Qt 5: pip install PyQt5-Qt5, which needs the system's libGL.so.1 "
                 f"and libgthread-2.0.so.0 (Debian: libgl1, libglib2.0-0). {'; '.join(failures)}"
             )
+    if getattr(sys.modules.get("envpool.procgen"), "_PROCGEN_IMPORT_ERROR", None):
+        del sys.modules["envpool.procgen"]  # it was imported before Qt was there, and gave up
 
 
 def make_env(args: Args, num_envs: int, start_level: int) -> Procgen:
