@@ -502,7 +502,9 @@ class Agent(nn.Module):
         self.register_buffer("mask", torch.ones(features))  # of dropout, the same for every state
 
     def forward(self, frames: Tensor) -> tuple[Tensor, Tensor]:
-        x = (frames / 255.0).contiguous(memory_format=torch.channels_last)
+        x = frames / 255.0
+        if x.is_cuda:
+            x = x.contiguous(memory_format=torch.channels_last)
         hidden = self.network(x)
         if self.training:
             hidden = hidden * self.mask
@@ -770,8 +772,9 @@ class Learner:
             n: int(s.generate_state(1, np.uint64)[0]) for n, s in zip(names, streams, strict=True)
         }
         self.generators = {n: torch.Generator().manual_seed(seeds[n]) for n in names[:5]}
-        agent = Agent(args, self.generators["init"]).to(self.device)
-        self.agent = agent.to(memory_format=torch.channels_last)
+        self.agent = Agent(args, self.generators["init"]).to(self.device)
+        if self.on_gpu:
+            self.agent.to(memory_format=torch.channels_last)  # on the CPU it is no faster
         self.optimizer = torch.optim.Adam(
             self.agent.parameters(), args.learning_rate, eps=1e-5, fused=True
         )
