@@ -17,6 +17,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from harness.launchers.groups import make_groups
 from harness.launchers.local import Outcome, run_local
 from harness.progress import Progress, duration
 from harness.report.page import write_report
@@ -41,6 +42,7 @@ def run_all(
     seeds: int | None = None,
     agents: int | None = None,
     env: tuple[str, ...] = (),
+    plain: bool = False,
 ) -> None:
     """Run what a suite still lacks, side by side, then report it.
 
@@ -55,6 +57,8 @@ def run_all(
         seeds: So many seeds: the suite's first, then those that follow its last.
         agents: Only so many agents for each seed.
         env: Only these tasks, such as Hopper.
+        plain: One process for each agent, by the single files; by default the agents of a seed
+            share one, which computes the same in less time.
     """
     jobs = cores() if jobs is None else jobs
     if jobs < 1:
@@ -72,7 +76,7 @@ def run_all(
     outcome = Outcome()
     if todo:
         with Progress(console, store, todo) as progress:
-            outcome = run_local(todo, store, jobs, progress)
+            outcome = run_local(make_groups(todo, store, jobs, plain), store, jobs, progress)
     whole = load_results(load_suite(suite, total_timesteps=total_timesteps), store)
     make_report(whole, store)
     show_others(whole)

@@ -91,12 +91,22 @@ class Store:
         finally:
             os.close(descriptor)
 
-    def start(self, spec: RunSpec, command: list[str]) -> None:
-        """Say what is about to run, before it does."""
+    def start(self, spec: RunSpec, command: list[str], group: list[RunSpec]) -> None:
+        """Say what is about to run, before it does; of a group, the first has the log."""
         self.path(spec).mkdir(parents=True, exist_ok=True)
         self.path(spec, "failed.json").unlink(missing_ok=True)
         content = {"hash": spec.hash, "baseline": spec.baseline, "args": spec.args}
-        write_json(self.path(spec, "spec.json"), content | {"command": command})
+        content |= {"command": command, "agents": [run.args["agent"] for run in group]}
+        write_json(self.path(spec, "spec.json"), content)
+        if spec != group[0]:
+            about = f"trained together with {group[0].run_id}, whose log.txt has what was said\n"
+            self.path(spec, "log.txt").write_text(about)
+
+    def partners(self, spec: RunSpec) -> list[int]:
+        """Numbers of the agents that its process trains with it, itself included; [] if none."""
+        saved = read_json(self.path(spec, "spec.json"))
+        agents = [] if saved is None else saved.get("agents", [])
+        return agents if len(agents) > 1 else []
 
     def finish(self, spec: RunSpec, returncode: int, seconds: float) -> None:
         """Mark the run complete, or failed."""

@@ -6,13 +6,13 @@ import contextlib
 import functools
 import os
 import subprocess
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from harness.launchers.groups import Group, commands
 from harness.progress import Progress
 from harness.store import Store
 from harness.suite import RunSpec
@@ -33,7 +33,7 @@ class Outcome:
 
 @dataclass
 class _Child:
-    spec: RunSpec
+    group: Group
     process: subprocess.Popen[bytes]
     then: list[list[str]]
     """commands that follow, each if the one before it succeeds"""
@@ -51,57 +51,49 @@ class _Child:
         return False
 
 
-def commands(spec: RunSpec, store: Store) -> list[list[str]]:
-    """What runs it, one after the other, in the checkout's folder; a person can type it too."""
-    path = str(store.path(spec).resolve())
-    train = [f"baselines.{spec.baseline}", *spec.flags, "--run-dir", path, "--resume"]
-    made = [[sys.executable, "-m", *train]]
-    if spec.evaluation:
-        flags = [word for name, x in spec.evaluation.items() for word in (f"--{name}", str(x))]
-        made.append([sys.executable, "-m", "harness", "evaluate", path, *flags])
-    return made
-
-
-def run_local(specs: list[RunSpec], store: Store, jobs: int, progress: Progress) -> Outcome:
-    """Run them, `jobs` at a time; whatever ends this early stops the children first.
+def run_local(groups: list[Group], store: Store, jobs: int, progress: Progress) -> Outcome:
+    """Run the groups, `jobs` at a time; whatever ends this early stops the children first.
 
     A child that is stopped keeps its last checkpoint, and goes on from it when it is run again.
     """
-    waiting, children, outcome = deque(specs), [], Outcome()
+    waiting, children, outcome = deque(groups), [], Outcome()
     with _stopping(children):
         while waiting or children:
             while waiting and len(children) < jobs:
-                spec = waiting.popleft()
-                child = _start(spec, store, max(1, (os.cpu_count() or 1) // jobs))
+                group = waiting.popleft()
+                child = _start(group, store, max(1, (os.cpu_count() or 1) // jobs))
                 if child is not None:
                     children.append(child)
-                elif store.is_done(spec):
-                    outcome.done.append(spec)
-                    progress.ended(spec, "done by another process")
-                else:
-                    outcome.held.append(spec)
-                    progress.ended(spec, "being run by another process")
+                    continue
+                for spec in group:
+                    done = store.is_done(spec)
+                    (outcome.done if done else outcome.held).append(spec)
+                    how = "done by" if done else "being run by"
+                    progress.ended(spec, f"{how} another process")
             for child in [c for c in children if c.ended()]:
                 children.remove(child)
                 seconds = time.monotonic() - child.started
-                store.finish(child.spec, child.process.returncode, seconds)
-                child.resources.close()
                 good = child.process.returncode == 0
-                (outcome.done if good else outcome.failed).append(child.spec)
-                progress.ended(child.spec, f"{'done' if good else 'FAILED'} in {seconds:.0f} s")
-            progress.update([child.spec for child in children])
+                for spec in child.group:
+                    store.finish(spec, child.process.returncode, seconds / len(child.group))
+                    (outcome.done if good else outcome.failed).append(spec)
+                child.resources.close()
+                for spec in child.group:
+                    progress.ended(spec, f"{'done' if good else 'FAILED'} in {seconds:.0f} s")
+            progress.update([spec for child in children for spec in child.group])
             time.sleep(0.1)
     return outcome
 
 
-def _start(spec: RunSpec, store: Store, threads: int) -> _Child | None:
+def _start(group: Group, store: Store, threads: int) -> _Child | None:
     with contextlib.ExitStack() as stack:
-        lock = stack.enter_context(store.lock(spec))
-        if lock is None or store.is_done(spec):  # by another launcher since the plan was made
+        locks = [stack.enter_context(store.lock(spec)) for spec in group]
+        if None in locks or any(map(store.is_done, group)):  # by another launcher since the plan
             return None
-        first, *then = commands(spec, store)
-        store.start(spec, first)
-        log = stack.enter_context(open(store.path(spec, "log.txt"), "ab"))
+        first, *then = commands(group, store)
+        for spec in group:
+            store.start(spec, first, group)
+        log = stack.enter_context(open(store.path(group[0], "log.txt"), "ab"))
         start = functools.partial(
             subprocess.Popen[bytes],
             cwd=ROOT,
@@ -110,9 +102,9 @@ def _start(spec: RunSpec, store: Store, threads: int) -> _Child | None:
             stdout=log,
             stderr=subprocess.STDOUT,
             start_new_session=True,  # Ctrl-C is for run-all, which stops them in turn
-            pass_fds=[lock],
+            pass_fds=locks,
         )
-        return _Child(spec, start(first), then, start, stack.pop_all(), time.monotonic())
+        return _Child(group, start(first), then, start, stack.pop_all(), time.monotonic())
 
 
 @contextlib.contextmanager
