@@ -17,6 +17,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from harness.estimate import Cost, EstimateError, measure
 from harness.launchers.groups import make_groups
 from harness.launchers.local import Outcome, run_local
 from harness.progress import Progress, duration
@@ -43,6 +44,7 @@ def run_all(
     agents: int | None = None,
     env: tuple[str, ...] = (),
     plain: bool = False,
+    dry_run: bool = False,
 ) -> None:
     """Run what a suite still lacks, side by side, then report it.
 
@@ -59,6 +61,8 @@ def run_all(
         env: Only these tasks, such as Hopper.
         plain: One process for each agent, by the single files; by default the agents of a seed
             share one, which computes the same in less time.
+        dry_run: Run nothing for good: measure two updates of each kind of run, and say what the
+            rest takes in hours and bytes.
     """
     jobs = cores() if jobs is None else jobs
     if jobs < 1:
@@ -73,6 +77,9 @@ def run_all(
         f"[bold]{plan.name}[/]: {plan.title}. {len(plan.runs)} runs, {plan.timesteps:,} steps; "
         f"{done} done before, {len(todo)} to do, {jobs} at a time."
     )
+    if dry_run:
+        show_costs(measure(make_groups(todo, store, jobs, plain), jobs, console), jobs)
+        return
     outcome = Outcome()
     if todo:
         with Progress(console, store, todo) as progress:
@@ -205,6 +212,21 @@ def show_others(results: Results) -> None:
         say(f"To come: run-all --suite {name} takes {what}{cost}.")
 
 
+def show_costs(costs: list[Cost], jobs: int) -> None:
+    """What is to be run, by algorithm and task, and the sum."""
+    table = Table("algorithm", "task", "runs", "steps", "steps/s", "hours", "MB")
+    for c in costs:
+        table.add_row(c.algorithm, c.environment, str(c.runs), f"{c.steps:,}", f"{c.speed:,.0f}",
+                      f"{c.hours:,.1f}", f"{c.bytes / 1e6:,.0f}")  # fmt: skip
+    console.print(table)
+    hours = sum(c.hours for c in costs)
+    say(
+        f"{sum(c.runs for c in costs)} runs, {sum(c.steps for c in costs):,} steps: "
+        f"{hours:,.1f} hours of one process, {duration(3600 * hours / jobs)} with {jobs} at a "
+        f"time, {sum(c.bytes for c in costs) / 1e9:.2f} GB. Evaluations come on top."
+    )
+
+
 def cores() -> int:
     """Cores that this process may use."""
     affinity = getattr(os, "sched_getaffinity", None)
@@ -218,7 +240,7 @@ def main() -> None:
         signal.signal(signal.SIGHUP, signal.default_int_handler)
     try:
         app.cli(prog="python -m harness", description=__doc__)
-    except (SuiteError, StoreError, EvaluationError) as error:
+    except (SuiteError, StoreError, EvaluationError, EstimateError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         say("\nInterrupted: the same command continues from the runs' last checkpoints.")
