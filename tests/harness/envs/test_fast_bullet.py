@@ -37,7 +37,7 @@ STOCK = {
 def test_the_stock_package_is_the_one_that_the_fast_tasks_follow(name):
     module = importlib.import_module(f"pybullet_envs_gymnasium.{name}")
     digest = hashlib.sha256(inspect.getsource(module).encode()).hexdigest()
-    assert digest.startswith(STOCK[name]) and STOCK[name], (
+    assert digest[:16] == STOCK[name], (
         f"{module.__file__} is not that of pybullet_envs_gymnasium 0.6.0. Read what changed, let "
         f"harness/envs/fast_bullet.py follow, run `pytest -m slow {__file__}`, then record "
         f"{digest[:16]} here."
@@ -124,32 +124,27 @@ def test_20000_random_steps_and_resets(pair, task):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_to_the_time_limit_with_smooth_actions_beyond_their_bounds(pair, task):
-    """Played on past their ends, episodes reach what random ones never do."""
+    """Played on past their ends, episodes go where random ones never do; robots stay equal too."""
     envs = pair(task)
     phase = np.linspace(0, 5, envs[0].action_space.shape[0])
-    robots = [env.unwrapped.robot for env in envs]
-    seen = set()
+    seen = {
+        name: set() for name in ("joints_at_limit", "feet_contact", "walk_target_x", "body_xyz")
+    }
 
     def act(i, obs):
-        for stock, fast in [[vars(robot) for robot in robots]]:
-            for name in ("joints_at_limit", "walk_target_x", "initial_z", "body_xyz", "gamma"):
-                if name in stock:
-                    assert stock[name] == fast[name], name
-                    assert type(stock[name]) is type(fast[name]) or name == "body_xyz"
-            if task in LOCOMOTION:
-                assert np.array_equal(stock["feet_contact"], fast["feet_contact"])
-                seen.update({("limit", bool(stock["joints_at_limit"]))})
-                seen.update(("contact", float(x)) for x in stock["feet_contact"])
-                seen.add(("target", stock["walk_target_x"]))
+        stock, fast = (vars(env.unwrapped.robot) for env in envs)
+        for name in seen.keys() & stock.keys():
+            assert np.array_equal(stock[name], fast[name]), name
+            seen[name].update(np.ravel(stock[name]))
         return (2 * np.sin(0.1 * i + phase)).astype(np.float32)
 
-    limit = envs[0].spec.max_episode_steps
-    _, truncations = play(envs, limit + 50, act, past_termination=True)
+    _, truncations = play(envs, envs[0].spec.max_episode_steps + 50, act, past_termination=True)
     assert truncations >= 1
     if task in LOCOMOTION:
-        assert {("limit", True), ("limit", False), ("contact", 0.0), ("contact", 1.0)} <= seen
-    targets = [x for name, x in seen if name == "target"]
-    assert len(targets) > 5 if "Flagrun" in task else len(targets) <= 1
+        assert seen["feet_contact"] == {0.0, 1.0}
+        assert len(seen["joints_at_limit"]) > 1
+    if "Flagrun" in task:
+        assert len(seen["walk_target_x"]) > 1_000 // 150  # a flag stands for 150 steps
 
 
 @pytest.mark.slow
@@ -219,7 +214,7 @@ def test_a_state_that_is_not_a_number_ends_the_episode(pair, capsys):
     for env in envs:
         env.unwrapped.robot.initial_z = np.nan
     capsys.readouterr()
-    answers = [env.step(np.zeros(6, np.float32)) for env in envs]
+    answers = [env.unwrapped.step(np.zeros(6, np.float32)) for env in envs]  # no checker warns
     assert [answer[2] for answer in answers] == [True, True]
     assert answers[0][0].tobytes() == answers[1][0].tobytes()
     assert capsys.readouterr().out.count("~INF~") == 2
