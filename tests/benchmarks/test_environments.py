@@ -5,6 +5,8 @@ Groups are one task each, so that ratios are read off one run.
 
 from __future__ import annotations
 
+import time
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from harness.envs import fast_bullet
 STEPS = 500
 
 
+@pytest.mark.benchmark(timer=time.process_time)  # other jobs of the machine disturb it less
 @pytest.mark.parametrize("kind", ["stock", "fast"])
 @pytest.mark.parametrize("name", fast_bullet.NAMES)
 def test_environment(benchmark, name, kind):
