@@ -76,9 +76,10 @@ def check_args(baseline: str, args: dict[str, Any], where: str) -> None:
             raise SuiteError(f"{where}: {name} must be {hints[name]}, got {value!r}")
     try:
         cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in args.items()})
-        importlib.import_module("pybullet_envs_gymnasium")  # registers its tasks
         if not has_games:
-            gym.spec(args["env_id"])
+            registers, _, name = args["env_id"].rpartition(":")
+            importlib.import_module(registers or "pybullet_envs_gymnasium")
+            gym.spec(name)
     except (ValueError, gym.error.Error, ModuleNotFoundError) as error:
         raise SuiteError(f"{where}: {error}") from error
 
