@@ -337,7 +337,6 @@ class ProcgenEngine:
     """OpenAI's engine: the step that ends an episode returns the next one's first frame."""
 
     autoreset_mode = AutoresetMode.SAME_STEP
-    time_limit = 1000  # the engine's own, which it reports as any other end
 
     def __init__(
         self, game: str, num_envs: int, mode: str, num_threads: int, levels: dict, seed: int
@@ -351,7 +350,7 @@ class ProcgenEngine:
             num=num_envs, env_name=game, distribution_mode=mode, rand_seed=seed,
             num_threads=num_threads or os.cpu_count(), **levels,
         )  # fmt: skip
-        self.steps = np.zeros(num_envs, np.int64)
+        self.steps, self.time_limit = np.zeros(num_envs, np.int64), TIME_LIMITS.get(game, 1000)
 
     def first_frames(self) -> np.ndarray:
         return self.env.observe()[1]["rgb"].transpose(0, 3, 1, 2)
@@ -378,6 +377,8 @@ class ProcgenEngine:
         self.env.close()
 
 
+# the original engine's own, which it reports as any other end; 1000 in the other games
+TIME_LIMITS = {"bigfish": 6000, "bossfight": 4000, "leaper": 500, "maze": 500, "plunder": 4000}
 ENGINES = {"envpool": EnvPoolEngine, "procgen": ProcgenEngine}
 
 
