@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 import torch
 
@@ -73,6 +74,50 @@ def interrupted(baseline: ModuleType, args, monkeypatch, at_update: int) -> None
         patch.setattr(baseline, "update", stop)
         with pytest.raises(KeyboardInterrupt):
             baseline.train(args)
+
+
+class Scripted:
+    """Stands in for Procgen: each environment's episodes have the lengths listed for it.
+
+    The frame shows the step of the episode, the return is 10 if the length is odd, and the level
+    seed is 100 · environment + episode. A step after an end is a reset, as with EnvPool.
+    """
+
+    def __init__(self, lengths: list[list[int]], *, spends_a_step: bool = True) -> None:
+        self.num_envs, self.lengths, self.spends_a_step = len(lengths), lengths, spends_a_step
+
+    def reset(self, *, seed: int | None = None):
+        self.episode, self.t = np.zeros(self.num_envs, int), np.zeros(self.num_envs, int)
+        self.ended = np.zeros(self.num_envs, bool)
+        return self._frames(), {}
+
+    def step_async(self, actions: np.ndarray) -> None:
+        assert actions.shape == (self.num_envs,)
+
+    def step_wait(self):
+        reset = self.ended & self.spends_a_step
+        self.episode += self.ended
+        self.t = np.where(self.ended, 0, self.t) + ~reset
+        ends = zip(self.lengths, self.episode, self.t, strict=True)
+        self.ended = np.array([n < len(e) and t == e[n] for e, n, t in ends])
+        rewards = np.where(self.ended & (self.t % 2 == 1), 10.0, 0.0)
+        info = {"reset": reset}
+        if self.ended.any():
+            seeds = 100 * np.arange(self.num_envs) + self.episode
+            info |= {"episode": {"r": rewards, "l": self.t}, "_episode": self.ended}
+            info |= {"success": rewards > 0, "level_seed": seeds}
+        return self._frames(), rewards, self.ended, np.zeros(self.num_envs, bool), info
+
+    def step(self, actions: np.ndarray):
+        self.step_async(actions)
+        return self.step_wait()
+
+    def close(self) -> None:
+        pass
+
+    def _frames(self) -> np.ndarray:
+        shape = (self.num_envs, 3, 64, 64)
+        return np.broadcast_to(self.t[:, None, None, None], shape).astype(np.uint8)
 
 
 class Program:
