@@ -169,11 +169,8 @@ class Args:
         return self.total_timesteps // self.batch_size
 
     def regularizer(  # condwrap
-        self,
-        coefficient: float,
-        rng: torch.Generator,
-        fraction: float = 1.0,  # condwrap
-    ) -> ConditioningRegularizer:  # condwrap
+        self, coefficient: float, rng: torch.Generator, fraction: float = 1.0  # condwrap
+    ) -> ConditioningRegularizer:  # condwrap  # fmt: skip
         sizes = {"perturbation": self.perturbation, "radius": self.radius}  # condwrap
         return ConditioningRegularizer(  # condwrap
             coefficient, self.lambda_min, self.lambda_max,  # condwrap
