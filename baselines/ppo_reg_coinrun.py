@@ -611,7 +611,7 @@ def rollout(args: Args, learner: Learner, envs: list[Procgen], frames: list[np.n
         receive(args.num_steps - 1, g)
     last = torch.cat([agent(torch.tensor(x, device=device))[1] for x in frames])
     next_values = torch.cat([values[1:], last[None]]).cpu() * (1 - torch.from_numpy(dones))
-    learner.scale_rewards(args, rewards, dones)
+    learner.scale_rewards(args, rewards, dones, counts)
     rewards, dones, counts = map(torch.from_numpy, (rewards, dones, counts))
     return Rollout(
         obs, actions, logprobs, rewards, dones, values.cpu(), next_values, counts, episodes
@@ -808,12 +808,15 @@ class Learner:
             kept = (uniform >= args.dropout).float() / (1 - args.dropout)
             self.agent.mask.copy_(kept)
 
-    def scale_rewards(self, args: Args, rewards: np.ndarray, dones: np.ndarray) -> None:
+    def scale_rewards(
+        self, args: Args, rewards: np.ndarray, dones: np.ndarray, counts: np.ndarray
+    ) -> None:
         """Divide `[T, N]` rewards by the running deviation of the discounted return, in place."""
         if args.norm_reward:
             for t in range(len(rewards)):
                 self.discounted = self.discounted * args.gamma + rewards[t]
-                self.stats["return_rms"].update(self.discounted)
+                if counts[t].any():
+                    self.stats["return_rms"].update(self.discounted[counts[t]])
                 rewards[t] /= np.sqrt(self.stats["return_rms"].var + 1e-8)
                 self.discounted *= 1 - dones[t]
 
