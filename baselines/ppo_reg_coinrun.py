@@ -134,7 +134,7 @@ class Args:
         if self.env_id not in GAMES:
             raise ValueError(f"env_id must be one of {', '.join(GAMES)}, got {self.env_id!r}")
         for name, least in AT_LEAST.items():
-            if getattr(self, name) < least:
+            if not least <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
         for name in ("learning_rate", "clip_coef", "max_grad_norm"):
             if not 0 < getattr(self, name) < math.inf:
