@@ -158,7 +158,8 @@ class Args:
             raise ValueError(
                 f"total_timesteps must be at least {batch}, got {self.total_timesteps}"
             )
-        self.regularizer(self.coefficient, torch.Generator())  # condwrap: its own checks
+        # condwrap: the regularizer's own checks
+        self.regularizer(self.coefficient, torch.Generator(), self.probe_fraction)  # condwrap
 
     @property
     def batch_size(self) -> int:
