@@ -16,14 +16,20 @@ import numpy as np
 import pytest
 import torch
 
-from baselines import ppo_reg, trpo_reg
+from baselines import ppo_reg, ppo_reg_coinrun, trpo_reg
 
 BASELINES = (ppo_reg, trpo_reg)
+ALL = (*BASELINES, ppo_reg_coinrun)
 SMALL = {
     ppo_reg: {"num_steps": 64, "num_minibatches": 4, "update_epochs": 2, "vf_epochs": 2},
     trpo_reg: {"num_steps": 64, "num_minibatches": 4, "vf_epochs": 2},
 }
-FLAGS = ["--env-id=Pendulum-v1", "--num-steps=64", "--num-minibatches=4", "--checkpoint-interval=2"]
+FLAGS = ["--num-steps=64", "--num-minibatches=4", "--checkpoint-interval=2"]
+OWN_FLAGS = {
+    ppo_reg: ["--env-id=Pendulum-v1"],
+    trpo_reg: ["--env-id=Pendulum-v1"],
+    ppo_reg_coinrun: ["--num-envs=1", "--num-groups=1", "--num-levels=8", "--update-epochs=1"],
+}
 
 
 def name(baseline: ModuleType) -> str:
@@ -36,13 +42,31 @@ def pendulum(baseline: ModuleType, path: Path, **changes):
     return baseline.Args(**{**settings, **SMALL[baseline], **changes})
 
 
+def coinrun(path: Path, **changes):
+    """Arguments of a run of 5 short updates on CoinRun."""
+    settings = {"num_envs": 1, "num_groups": 1, "num_levels": 8, "distribution_mode": "easy"}
+    settings |= {"num_minibatches": 4, "update_epochs": 2, "eval_interval": 0, "run_dir": path}
+    settings |= {"num_steps": 64, "total_timesteps": 320}
+    return ppo_reg_coinrun.Args(**{**settings, **changes})
+
+
+def short_run(baseline: ModuleType, path: Path, **changes):
+    """Arguments of a run of 5 updates of 64 steps."""
+    if baseline is ppo_reg_coinrun:
+        return coinrun(path, **changes)
+    return pendulum(baseline, path, **changes)
+
+
 def read_metrics(path: Path) -> list[dict[str, str]]:
     with open(path / "metrics.csv", newline="") as file:
         return list(csv.DictReader(file))
 
 
 def without_speed(path: Path) -> list[dict[str, str]]:
-    return [{k: v for k, v in row.items() if k != "charts/SPS"} for row in read_metrics(path)]
+    return [
+        {k: v for k, v in row.items() if not k.startswith("charts/SPS")}
+        for row in read_metrics(path)
+    ]
 
 
 def flat(module: torch.nn.Module) -> torch.Tensor:
@@ -50,6 +74,8 @@ def flat(module: torch.nn.Module) -> torch.Tensor:
 
 
 def weights(learner) -> torch.Tensor:
+    if hasattr(learner, "agent"):
+        return flat(learner.agent)
     return torch.cat([flat(learner.actor), flat(learner.critic)])
 
 
@@ -129,7 +155,7 @@ class Program:
         self.log = folder / "log.txt"
         with open(self.log, "w") as log:
             self.process = subprocess.Popen(
-                [sys.executable, copy, *FLAGS, *flags],
+                [sys.executable, copy, *FLAGS, *OWN_FLAGS[baseline], *flags],
                 cwd=folder, env=environment, stdout=log, stderr=log, **kwargs,
             )  # fmt: skip
 
