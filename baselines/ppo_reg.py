@@ -465,6 +465,35 @@ TRAINED = ("actor", "critic", "actor_optimizer", "critic_optimizer")
 TRAINED += ("regularizer", "probe")  # condwrap
 
 
+def open_logs(args: Args, saved: dict[str, Any] | None) -> SummaryWriter:
+    """Cut metrics.csv back to the checkpoint, and go on with TensorBoard's events from there."""
+    args.path.mkdir(parents=True, exist_ok=True)
+    with open(args.path / "metrics.csv", "a") as metrics:
+        size = saved["metrics_size"] if saved else 0
+        if metrics.tell() < size:
+            raise RunError(f"{metrics.name} lacks rows: remove its folder to start anew")
+        metrics.truncate(size)  # later rows are computed again
+    first = saved["learner"]["update"] if saved else 0
+    writer = SummaryWriter(str(args.path), purge_step=first * args.batch_size + 1)
+    rows = "".join(f"\n|{name}|{value}|" for name, value in vars(args).items())
+    writer.add_text("hyperparameters", f"|parameter|value|\n|-|-|{rows}")
+    return writer
+
+
+def make_row(
+    args: Args, learner: Learner, data: Rollout, losses: dict[str, float], speed: float
+) -> dict[str, float]:
+    """What is logged of an update."""
+    return {
+        "global_step": learner.update * args.batch_size,
+        "charts/episodic_return": float(np.mean(data.returns or math.nan)),
+        "charts/episodic_length": float(np.mean(data.lengths or math.nan)),
+        "charts/SPS": speed,
+        **losses,
+        **measure_conditioning(args, learner, data.obs),  # condwrap
+    }
+
+
 def write_metrics(args: Args, writer: SummaryWriter, row: dict[str, float]) -> None:
     """A row of metrics.csv for each update, and the same numbers as TensorBoard scalars."""
     with open(args.path / "metrics.csv", "a", newline="") as file:
@@ -527,16 +556,8 @@ def train(args: Args) -> Learner:
     if learner.update == args.num_updates:
         print(f"{args.path} is finished")
         return learner
-    args.path.mkdir(parents=True, exist_ok=True)
+    writer = open_logs(args, saved)
     first, started, printed = learner.update, time.time(), -math.inf
-    with open(args.path / "metrics.csv", "a") as metrics:
-        size = saved["metrics_size"] if saved else 0
-        if metrics.tell() < size:
-            raise RunError(f"{metrics.name} lacks rows: remove its folder to start anew")
-        metrics.truncate(size)  # later rows are computed again
-    writer = SummaryWriter(str(args.path), purge_step=first * args.batch_size + 1)
-    rows = "".join(f"\n|{name}|{value}|" for name, value in vars(args).items())
-    writer.add_text("hyperparameters", f"|parameter|value|\n|-|-|{rows}")
     while learner.update < args.num_updates:  # from one checkpoint to the next
         checkpoint = learner.update // args.checkpoint_interval
         envs = make_envs(args, checkpoint, learner.stats)
@@ -546,14 +567,7 @@ def train(args: Args) -> Learner:
             next_obs, losses = data.next_obs, update(args, learner, data)
             learner.update += 1
             speed = (learner.update - first) * args.batch_size / (time.time() - started)
-            row = {
-                "global_step": learner.update * args.batch_size,
-                "charts/episodic_return": float(np.mean(data.returns or math.nan)),
-                "charts/episodic_length": float(np.mean(data.lengths or math.nan)),
-                "charts/SPS": speed,
-                **losses,
-                **measure_conditioning(args, learner, data.obs),  # condwrap
-            }
+            row = make_row(args, learner, data, losses, speed)
             write_metrics(args, writer, row)
             if time.time() - printed > 10 or learner.update == args.num_updates:
                 printed = time.time()
