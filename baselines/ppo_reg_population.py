@@ -190,13 +190,34 @@ def stack(networks: list[nn.Module]) -> list[Tensor]:
     return [torch.stack(each).detach() for each in parameters]
 
 
-def mlp(layers: list[Tensor], x: Tensor, activation: str) -> Tensor:
-    """All agents' networks, weights and biases in turn: `[N, B, n_in]` to `[N, B, n_out]`."""
+def forward(layers: list[Tensor], x: Tensor, activation: str) -> list[Tensor]:
+    """All agents' networks, weights and biases in turn: what each layer takes, and the output.
+
+    `[N, B, n_in]` to `[N, B, n_out]`. Autograd, and PyTorch's tanh, which takes ten times NumPy's,
+    would take more of the time than the matrix products.
+    """
+    inputs = [x]
     for i in range(0, len(layers), 2):
         x = torch.baddbmm(layers[i + 1][:, None], x, layers[i].mT)
         if i < len(layers) - 2:
-            x = getattr(torch, activation)(x)
-    return x
+            np.tanh(x.numpy(), out=x.numpy()) if activation == "tanh" else x.relu_()
+        inputs.append(x)
+    return inputs
+
+
+def backward(stack: Stack, inputs: list[Tensor], grad: Tensor, activation: str) -> None:
+    """From the gradient of the output, fill in those of the last leaves, the layers."""
+    first = len(stack.leaves) % 2  # the policy's log-std, which no layer holds
+    layers, gradients = stack.leaves[first:], stack.gradients[first:]
+    for i in reversed(range(0, len(layers), 2)):
+        x = inputs[i // 2]
+        # the product with its longer side last takes a fourth of the time in a narrow layer
+        wide = layers[i].shape[1] > layers[i].shape[2]
+        gradients[i].copy_(torch.bmm(x.mT, grad).mT if wide else torch.bmm(grad.mT, x))
+        torch.sum(grad, 1, out=gradients[i + 1])
+        if i:
+            grad = torch.bmm(grad, layers[i])
+            grad = grad.addcmul_(grad * x, x, value=-1) if activation == "tanh" else grad * (x > 0)
 
 
 class Stack:
@@ -209,50 +230,61 @@ class Stack:
         self.networks, self.optimizers = networks, optimizers
         shapes = [p.shape for p in networks[0].parameters()]
         self.sizes = [shape.numel() for shape in shapes]
-        values = torch.stack([parameters_to_vector(n.parameters()) for n in networks]).detach()
-        self.rows, self.grads = list(values), torch.zeros_like(values)
+        self.rows = torch.stack([parameters_to_vector(n.parameters()) for n in networks]).detach()
+        self.grads, self.exp_avg, self.exp_avg_sq = (torch.zeros_like(self.rows) for _ in range(3))
+        self.steps, self.learns = np.zeros(len(networks)), np.zeros(len(networks), bool)
         self.leaves, self.gradients = (
             [part.detach().unflatten(1, shape) for part, shape in zip(parts, shapes, strict=True)]
-            for parts in (values.split(self.sizes, 1), self.grads.split(self.sizes, 1))
+            for parts in (self.rows.split(self.sizes, 1), self.grads.split(self.sizes, 1))
         )
-        group = optimizers[0].param_groups[0]
-        settings = {name: group[name] for name in ("lr", "betas", "eps")}
-        self.optimizer = torch.optim.Adam(self.rows, fused=True, **settings)
-        for row, network, optimizer in zip(self.rows, networks, optimizers, strict=True):
-            states = [optimizer.state[p] for p in network.parameters() if p in optimizer.state]
-            if states:
-                moments = ("exp_avg", "exp_avg_sq")
-                state = {key: torch.cat([s[key].flatten() for s in states]) for key in moments}
-                self.optimizer.state[row] = {"step": states[0]["step"].clone(), **state}
-        self.learn([True] * len(networks))
-        for leaf in self.leaves:
-            leaf.requires_grad_()
+        for i, (_, state) in enumerate(self.states()):
+            if state:
+                self.steps[i] = state[0]["step"]
+                for key in ("exp_avg", "exp_avg_sq"):
+                    torch.cat([x[key].flatten() for x in state], out=getattr(self, key)[i])
+        self.learn(np.ones(len(networks), bool))
 
-    def learn(self, learns: list[bool]) -> None:
+    def states(self) -> Iterator[tuple[list[nn.Parameter], list[dict[str, Tensor]]]]:
+        """Each agent's parameters, and what its own Adam holds of them, if it has stepped."""
+        for network, optimizer in zip(self.networks, self.optimizers, strict=True):
+            parameters = list(network.parameters())
+            yield parameters, [optimizer.state[p] for p in parameters if p in optimizer.state]
+
+    def learn(self, learns: np.ndarray) -> None:
         """Step these agents alone from now on."""
-        for row, gradient, on in zip(self.rows, self.grads, learns, strict=True):
-            row.grad = gradient if on else None
+        if (learns == self.learns).all():
+            return
+        self.learns = learns
+        # Adam takes all in one piece as long as it has taken equally many steps with each
+        alike = learns.all() and len(set(self.steps)) == 1
+        pieces = [slice(None)] if alike else [slice(i, i + 1) for i in np.flatnonzero(learns)]
+        group, parts = self.optimizers[0].param_groups[0], [self.rows[i] for i in pieces]
+        settings = {name: group[name] for name in ("lr", "betas", "eps")}
+        self.optimizer = torch.optim.Adam(parts or [torch.zeros(0)], fused=True, **settings)
+        for i, part in zip(pieces, parts, strict=True):
+            part.grad, step = self.grads[i], torch.tensor(self.steps[i][0], dtype=torch.float32)
+            moments = {"exp_avg": self.exp_avg[i], "exp_avg_sq": self.exp_avg_sq[i]}
+            self.optimizer.state[part] = {"step": step, **moments}
 
-    def step(self, losses: Tensor, max_grad_norm: float) -> None:
-        """Step each agent down its own loss, `[N]`."""
-        gradients = torch.autograd.grad(losses.sum(), self.leaves)
-        for target, gradient in zip(self.gradients, gradients, strict=True):
-            target.copy_(gradient)
+    def step(self, max_grad_norm: float) -> None:
+        """Step each agent down its own gradient."""
         norms = torch.linalg.vector_norm(self.grads, dim=1, keepdim=True)
-        self.grads.mul_((max_grad_norm / (norms + 1e-6)).clamp(max=1))
+        self.grads.mul_((max_grad_norm / (norms + 1e-6)).clamp_(max=1))
         self.optimizer.step()
+        self.steps += self.learns
 
     def store(self) -> None:
         """Give each agent its parameters and moments back, as if it had been trained alone."""
-        for row, network, optimizer in zip(self.rows, self.networks, self.optimizers, strict=True):
-            state = self.optimizer.state[row]
-            moments = [state[key].split(self.sizes) for key in ("exp_avg", "exp_avg_sq")]
-            for p, x, mean, square in zip(
-                network.parameters(), row.split(self.sizes), *moments, strict=True
-            ):
-                p.data.copy_(x.view_as(p))
-                optimizer.state[p] = {
-                    "step": state["step"].clone(),
+        for i, (parameters, _) in enumerate(self.states()):
+            rows = zip(
+                parameters,
+                *(x[i].split(self.sizes) for x in (self.rows, self.exp_avg, self.exp_avg_sq)),
+                strict=True,
+            )
+            for p, value, mean, square in rows:
+                p.data.copy_(value.view_as(p))
+                self.optimizers[i].state[p] = {
+                    "step": torch.tensor(self.steps[i], dtype=torch.float32),
                     "exp_avg": mean.view_as(p).clone(),
                     "exp_avg_sq": square.view_as(p).clone(),
                 }
@@ -281,7 +313,7 @@ def rollout(
     arrays = [x.numpy() for x in (obs, after, rewards, ends, dones)]
     for t in range(args.num_steps):
         arrays[0][t] = next_obs
-        actions[t] += mlp(actor, obs[t].view(*shape[1:], -1), args.activation)
+        actions[t] += forward(actor, obs[t].view(*shape[1:], -1), args.activation)[-1]
         action = actions[t].numpy().reshape(-1, *space.shape)
         answer = envs.step(np.clip(action, space.low, space.high))
         next_obs, arrays[2][t], arrays[3][t], cut, info = answer
@@ -291,7 +323,7 @@ def rollout(
             for which, key in enumerate("rl"):
                 episodes[i // args.num_envs][which].append(info["episode"][key][i].item())
     values, next_values = (
-        mlp(critic, by_agent(x.view(*shape, -1)), args.activation)
+        forward(critic, by_agent(x.view(*shape, -1)), args.activation)[-1]
         .view(args.num_agents, args.num_steps, args.num_envs)
         .transpose(0, 1)
         for x in (obs, after)
@@ -328,64 +360,95 @@ def make_batch(args: Args, actor: Stack, rollouts: list[single.Rollout]) -> tupl
     obs, actions, values = (by_agent(x) for x in (data.obs, data.actions, data.values))
     targets = advantages + values
     log_std, *layers = actor.leaves
-    with torch.no_grad():
-        logprobs = log_prob(mlp(layers, obs, args.activation), log_std, actions)
+    logprobs, _ = log_prob(forward(layers, obs, args.activation)[-1], log_std, actions)
     explained = 1 - (targets - values).var(1) / targets.var(1)
     return Batch(obs, actions, logprobs, advantages, targets), explained
 
 
-def log_prob(means: Tensor, log_std: Tensor, actions: Tensor) -> Tensor:
-    """Of a Gaussian, but for a constant: `[N, B]`."""
-    log_std = log_std[:, None]
-    return -(0.5 * ((actions - means) * (-log_std).exp()).square() + log_std).sum(-1)
+def log_prob(means: Tensor, log_std: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+    """Of a Gaussian, but for a constant, `[N, B]`; and the actions in standard deviations."""
+    scaled = (actions - means) * (-log_std).exp()[:, None]
+    return -0.5 * scaled.square().sum(-1) - log_std.sum(-1, keepdim=True), scaled
 
 
-def minibatches(args: Args, learners: list[Any], batch: Batch) -> Iterator[Batch]:
-    """An epoch, each agent's steps in an order of its own."""
+def minibatches(args: Args, learners: list[Any], batch: Batch) -> Batch:
+    """An epoch, each agent's steps in an order of its own: `[minibatches, N, b, ...]`."""
     size, agents = args.batch_size, args.num_agents
     orders = [torch.randperm(size, generator=x.generators["minibatch"]) for x in learners]
     rows = torch.stack(orders) + size * torch.arange(agents)[:, None]
-    order = rows.view(agents, args.num_minibatches, -1).transpose(0, 1)  # [minibatches, N, b]
-    for columns in zip(*[x.flatten(0, 1)[order] for x in batch], strict=True):
-        yield Batch(*columns)
+    order = rows.view(agents, args.num_minibatches, -1).transpose(0, 1)
+    epoch = Batch(*[x.flatten(0, 1)[order] for x in batch])
+    std, mean = torch.std_mean(epoch.advantages, -1, keepdim=True)
+    return epoch._replace(advantages=(epoch.advantages - mean) / (std + 1e-8))
 
 
-def draw_delta(learners: list[Any], obs: Tensor, learns: list[bool]) -> Tensor:  # condwrap
-    """What each learning agent's regularizer would draw next, `[N, b, obs_dim]`."""  # condwrap
+def draw_delta(learners: list[Any], obs: Tensor, learns: np.ndarray) -> Tensor:  # condwrap
+    """What the regularizers of learning agents would draw in turn, `[M, N, b, n]`."""  # condwrap
     noise = torch.ones_like(obs)  # condwrap
-    for x, learner, on in zip(noise, learners, learns, strict=True):  # condwrap
-        if on:  # condwrap
-            x.normal_(generator=learner.regularizer.generator)  # condwrap
+    for agent in np.flatnonzero(learns):  # condwrap
+        for x in noise[:, agent]:  # condwrap
+            x.normal_(generator=learners[agent].regularizer.generator)  # condwrap
     return learners[0].regularizer.perturbation(noise)  # condwrap
 
 
-def policy_losses(
-    args: Args, learners: list[Any], actor: Stack, part: Batch, learns: list[bool]
+def penalty_gradient(args: Args, output: Tensor, moved: Tensor, delta: Tensor) -> Any:  # condwrap
+    """Of each agent's coefficient · mean(psi), with respect to pi(S) and pi(S + delta)."""  # condwrap
+    outputs = [x.detach().requires_grad_() for x in (output, moved)]  # condwrap
+    with torch.enable_grad():  # condwrap
+        quotient = conditioning_quotient(*outputs, delta, batch_ndim=2)  # condwrap
+        psi = clamping_penalty(quotient, args.lambda_min, args.lambda_max)  # condwrap
+        return torch.autograd.grad(args.coefficient * psi.mean(1).sum(), outputs)  # condwrap
+
+
+def policy_step(
+    args: Args, actor: Stack, part: Batch, delta: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Each agent's loss, `[N]`, and its logs, `[4, N]`; each by itself as the single file's."""
+    """One step down each agent's loss, the single file's; the log-ratios and log-stds before it.
+
+    Of -min(A r, A clip(r)) the slope in log r is -A r where that is the smaller one, else 0.
+    """
     (log_std, *layers), states, size = actor.leaves, part.obs, part.obs.shape[1]
-    if args.coefficient > 0:  # condwrap
-        delta = draw_delta(learners, states, learns)  # condwrap
+    if delta is not None:  # condwrap
         states = torch.cat([states, states + delta], 1)  # condwrap
-    means = mlp(layers, states, args.activation)
-    mean = means[:, :size]
-    logratio = log_prob(mean, log_std, part.actions) - part.logprobs
-    advantages = part.advantages - part.advantages.mean(1, keepdim=True)
-    advantages = advantages / (part.advantages.std(1, keepdim=True) + 1e-8)
+    *inputs, output = forward(layers, states, args.activation)
+    logprob, scaled = log_prob(output[:, :size], log_std, part.actions)
+    logratio = logprob - part.logprobs
+    ratio = logratio.exp()
+    gains = part.advantages * ratio
+    unclipped = gains <= part.advantages * ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
+    slopes = (gains * unclipped * (-1 / size))[..., None]
+    grad = slopes * scaled * (-log_std).exp()[:, None]
+    torch.sum(slopes * (scaled.square() - 1), 1, out=actor.gradients[0]).sub_(args.ent_coef)
+    if delta is not None:  # condwrap
+        clean, moved = penalty_gradient(args, output[:, :size], output[:, size:], delta)  # condwrap
+        grad = torch.cat([grad + clean, moved], 1)  # condwrap
+    before = logratio, log_std.clone()
+    backward(actor, inputs, grad, args.activation)
+    actor.step(args.max_grad_norm)
+    return before
+
+
+def value_step(args: Args, critic: Stack, part: Batch) -> Tensor:
+    """One step of each critic; its squared error before it, `[N]`."""
+    *inputs, values = forward(critic.leaves, part.obs, args.activation)
+    errors = values - part.targets[..., None]
+    backward(critic, inputs, (2 * args.vf_coef / errors.shape[1]) * errors, args.activation)
+    critic.step(args.max_grad_norm)
+    return errors.square().mean((1, 2))
+
+
+def policy_logs(args: Args, advantages: Tensor, seen: list[tuple[Tensor, Tensor]]) -> Tensor:
+    """Loss, entropy, KL estimate and share of clipped samples in an epoch: `[4, N]`."""
+    logratio, log_std = (torch.stack(x) for x in zip(*seen, strict=True))
     ratio = logratio.exp()
     clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
-    pg_losses = -torch.min(advantages * ratio, advantages * clipped).mean(1)
-    entropies = (0.5 + 0.5 * math.log(2 * math.pi) + log_std).sum(1)
-    losses = pg_losses - args.ent_coef * entropies
-    if args.coefficient > 0:  # condwrap
-        quotient = conditioning_quotient(mean, means[:, size:], delta, batch_ndim=2)  # condwrap
-        psi = clamping_penalty(quotient, args.lambda_min, args.lambda_max)  # condwrap
-        losses = losses + args.coefficient * psi.mean(1)  # condwrap
-    with torch.no_grad():
-        kl, clipfrac = (ratio - 1 - logratio).mean(1), (ratio != clipped).to(ratio.dtype).mean(1)
-        return losses, torch.stack([pg_losses, entropies, kl, clipfrac])
+    losses = -torch.min(advantages * ratio, advantages * clipped)
+    entropies = (0.5 + 0.5 * math.log(2 * math.pi) + log_std).sum(-1, keepdim=True)
+    logs = (losses, entropies, ratio - 1 - logratio, (ratio != clipped).to(ratio.dtype))
+    return torch.stack([x.mean((0, 2)) for x in logs])
 
 
+@torch.no_grad()
 def update(
     args: Args, learners: list[Any], rollouts: list[single.Rollout]
 ) -> list[dict[str, float]]:
@@ -398,34 +461,34 @@ def update(
     actor = Stack([x.actor for x in learners], [x.actor_optimizer for x in learners])
     critic = Stack([x.critic for x in learners], [x.critic_optimizer for x in learners])
     batch, explained = make_batch(args, actor, rollouts)
-    learns, epochs = torch.ones(args.num_agents, dtype=torch.bool), torch.zeros(args.num_agents)
-    policy_logs, value_losses = [], []
+    learns, epochs = np.ones(args.num_agents, bool), np.zeros(args.num_agents, int)
+    logs, value_losses = [], []
     for epoch in range(max(args.update_epochs, args.vf_epochs)):
+        parts, seen = minibatches(args, learners, batch), []
         learns = learns & (epoch < args.update_epochs)
-        epochs += learns
-        learning = learns.tolist()
-        actor.learn(learning)
-        for part in minibatches(args, learners, batch):
-            if any(learning):
-                losses, logs = policy_losses(args, learners, actor, part, learning)
-                actor.step(losses, args.max_grad_norm)
-                policy_logs.append(logs)
+        actor.learn(learns)
+        deltas = [None] * args.num_minibatches
+        if args.coefficient > 0 and learns.any():  # condwrap
+            deltas = draw_delta(learners, parts.obs, learns)  # condwrap
+        for *columns, delta in zip(*parts, deltas, strict=True):
+            part = Batch(*columns)
+            if learns.any():
+                seen.append(policy_step(args, actor, part, delta))
             if epoch < args.vf_epochs:
-                values = mlp(critic.leaves, part.obs, args.activation).squeeze(-1)
-                value_loss = (values - part.targets).square().mean(1)
-                critic.step(args.vf_coef * value_loss, args.max_grad_norm)
-                value_losses.append(value_loss.detach())
-        if any(learning) and args.target_kl is not None:
-            epoch_kl = torch.stack(policy_logs[-args.num_minibatches :])[:, 2].mean(0)
-            learns = learns & (epoch_kl <= args.target_kl)
+                value_losses.append(value_step(args, critic, part))
+        if learns.any():
+            epochs += learns
+            logs.append(policy_logs(args, parts.advantages, seen))
+            if args.target_kl is not None:
+                learns = learns & (logs[-1][2] <= args.target_kl).numpy()
     actor.store()
     critic.store()
     names = ("policy_loss", "entropy", "approx_kl", "clipfrac", "value_loss", "explained_variance")
-    policy, value = torch.stack(policy_logs, -1), torch.stack(value_losses).mean(0)  # [4, N, steps]
+    policy, value = torch.stack(logs), torch.stack(value_losses).mean(0)  # [epochs, 4, N], [N]
     rows = []
-    for i, steps in enumerate((epochs * args.num_minibatches).int().tolist()):
-        logs = [*policy[:, i, :steps].mean(-1), value[i], explained[i]]
-        losses = {f"losses/{name}": x.item() for name, x in zip(names, logs, strict=True)}
+    for i, count in enumerate(epochs):
+        means = [*policy[:count, :, i].mean(0), value[i], explained[i]]
+        losses = {f"losses/{name}": x.item() for name, x in zip(names, means, strict=True)}
         rate = learners[i].actor_optimizer.param_groups[0]["lr"]
         rows.append({"charts/learning_rate": rate, **losses})
     return rows
