@@ -16,8 +16,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from baselines import ppo_reg
-from baselines import ppo_reg_population as population
+from baselines import population, ppo_reg, ppo_reg_population
 from tests.baselines.helpers import (
     FLAGS,
     SMALL,
@@ -27,11 +26,11 @@ from tests.baselines.helpers import (
 )
 
 
-def arguments(folder=None, **changes) -> population.Args:
+def arguments(folder=None, **changes) -> ppo_reg_population.Args:
     """Arguments of a run of 3 agents and 5 short updates."""
     settings = {"env_id": "Pendulum-v1", "total_timesteps": 320, "num_agents": 3, **SMALL[ppo_reg]}
     path = folder and folder / "a{agent}"
-    return population.Args(**{**settings, "run_dir": path, **changes})
+    return ppo_reg_population.Args(**{**settings, "run_dir": path, **changes})
 
 
 def seeds_of(args, checkpoint: int = 0) -> list[int]:
@@ -111,7 +110,7 @@ def test_two_updates_are_those_of_the_single_file(changes, dtype, tolerance):
         learner.actor.to(dtype), learner.critic.to(dtype)
     alone = copy.deepcopy(learners)
     for number in range(2):  # the second begins with Adam's moments
-        ours = population.update(args, learners, rollouts)
+        ours = ppo_reg_population.update(args, learners, rollouts)
         for i, run in enumerate(args.runs):
             theirs = ppo_reg.update(run, alone[i], rollouts[i])
             assert ours[i] == pytest.approx(theirs, abs=10 * tolerance)
@@ -127,7 +126,7 @@ def test_each_agent_stops_at_its_own_kl():
     epochs = []
     args = arguments(**changes, target_kl=1e-4)
     alone = copy.deepcopy(learners)
-    population.update(args, learners, rollouts)
+    ppo_reg_population.update(args, learners, rollouts)
     for i, run in enumerate(args.runs):
         ppo_reg.update(run, alone[i], rollouts[i])
         check_close(learners[i], alone[i], 1e-5)
@@ -295,7 +294,7 @@ def test_observations_and_actions_of_any_shape(tmp_path):
 
     gym.register("test/PopulationSquare-v0", Square)
     args = arguments(tmp_path, env_id="test/PopulationSquare-v0", total_timesteps=64)
-    assert population.train(args)[2].actor.log_std.shape == (4,)
+    assert ppo_reg_population.train(args)[2].actor.log_std.shape == (4,)
 
 
 # --- files ---------------------------------------------------------------------------------------
@@ -305,7 +304,7 @@ RESUMABLE = {"checkpoint_interval": 2, "total_timesteps": 7 * 64}
 
 def interrupt(args, monkeypatch, at_update: int) -> None:
     """Train until Ctrl-C comes in the middle of an update."""
-    update = population.update
+    update = ppo_reg_population.update
 
     def stop(args, learners, rollouts):
         if learners[0].update == at_update:
@@ -313,9 +312,9 @@ def interrupt(args, monkeypatch, at_update: int) -> None:
         return update(args, learners, rollouts)
 
     with monkeypatch.context() as patch:
-        patch.setattr(population, "update", stop)
+        patch.setattr(ppo_reg_population, "update", stop)
         with pytest.raises(KeyboardInterrupt):
-            population.train(args)
+            ppo_reg_population.train(args)
 
 
 def check_same_runs(one, other, agents: int = 3) -> None:
@@ -347,10 +346,10 @@ def test_a_resumed_population_is_bit_for_bit_the_undisturbed_one(
     tmp_path, monkeypatch, changes, at_update
 ):
     settings = {**RESUMABLE, **changes}
-    undisturbed = population.train(arguments(tmp_path / "x", **settings))
+    undisturbed = ppo_reg_population.train(arguments(tmp_path / "x", **settings))
     interrupt(arguments(tmp_path / "y", **settings), monkeypatch, at_update)
     assert len(read_metrics(tmp_path / "y" / "a2")) == at_update
-    resumed = population.train(arguments(tmp_path / "y", resume=True, **settings))
+    resumed = ppo_reg_population.train(arguments(tmp_path / "y", resume=True, **settings))
     for one, other in zip(undisturbed, resumed, strict=True):
         check_close(one, other, 0.0)
     check_same_runs(tmp_path / "x", tmp_path / "y")
@@ -362,7 +361,7 @@ def test_a_population_killed_while_it_saves_goes_on_from_what_all_have(
     tmp_path, monkeypatch, saved_of, at_update
 ):
     undisturbed = arguments(tmp_path / "x", **RESUMABLE)
-    population.train(undisturbed)
+    ppo_reg_population.train(undisturbed)
     save = ppo_reg.save_checkpoint
 
     def stop(run, learner) -> None:
@@ -374,17 +373,17 @@ def test_a_population_killed_while_it_saves_goes_on_from_what_all_have(
         patch.setattr(ppo_reg, "save_checkpoint", stop)
         for resume in (False, True):  # the second attempt is killed as well
             with pytest.raises(KeyboardInterrupt):
-                population.train(arguments(tmp_path / "y", resume=resume, **RESUMABLE))
-    population.train(arguments(tmp_path / "y", resume=True, **RESUMABLE))
+                ppo_reg_population.train(arguments(tmp_path / "y", resume=resume, **RESUMABLE))
+    ppo_reg_population.train(arguments(tmp_path / "y", resume=True, **RESUMABLE))
     check_same_runs(tmp_path / "x", tmp_path / "y")
 
 
 def test_agents_at_different_updates_are_left_as_they_are(tmp_path):
     args = arguments(tmp_path, **RESUMABLE)
-    population.train(dataclasses.replace(args, num_agents=2))
+    ppo_reg_population.train(dataclasses.replace(args, num_agents=2))
     before = (tmp_path / "a0" / "checkpoint.pt").read_bytes()
     with pytest.raises(ppo_reg.RunError, match=r"at updates 7 \(agent 0\), 7 .*, 0 \(agent 2\)"):
-        population.train(dataclasses.replace(args, resume=True))
+        ppo_reg_population.train(dataclasses.replace(args, resume=True))
     assert (tmp_path / "a0" / "checkpoint.pt").read_bytes() == before
 
 
@@ -421,7 +420,7 @@ def test_either_program_goes_on_where_the_other_was_stopped(tmp_path, monkeypatc
 
 def test_a_run_directory_has_the_layout_of_a_single_run(tmp_path):
     args = arguments(tmp_path / "x", log_spectrum=2)
-    population.train(args)
+    ppo_reg_population.train(args)
     run = dataclasses.replace(args.runs[1], run_dir=tmp_path / "alone")
     ppo_reg.train(run)
     ours, theirs = tmp_path / "x" / "a1", tmp_path / "alone"
@@ -440,12 +439,12 @@ def test_a_run_directory_has_the_layout_of_a_single_run(tmp_path):
 
 
 def test_a_finished_population_stays_as_it_is(tmp_path, capsys):
-    population.train(arguments(tmp_path))
+    ppo_reg_population.train(arguments(tmp_path))
     files = [
         tmp_path / f"a{i}" / name for i in range(3) for name in ("metrics.csv", "checkpoint.pt")
     ]
     before = [file.read_bytes() for file in files]
-    learners = population.train(arguments(tmp_path, resume=True))
+    learners = ppo_reg_population.train(arguments(tmp_path, resume=True))
     assert before == [file.read_bytes() for file in files]
     assert "finished" in capsys.readouterr().out
     assert len(learners) == 3
@@ -453,7 +452,7 @@ def test_a_finished_population_stays_as_it_is(tmp_path, capsys):
 
 def test_the_global_random_state_is_left_alone(tmp_path):
     torch_before, numpy_before = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
-    population.train(arguments(tmp_path, perturb_obs=True))
+    ppo_reg_population.train(arguments(tmp_path, perturb_obs=True))
     assert torch.equal(torch.get_rng_state(), torch_before)
     np.testing.assert_array_equal(np.random.get_state()[1], numpy_before)  # noqa: NPY002
 
@@ -469,7 +468,7 @@ def test_videos_of_every_agent_have_a_folder_of_their_own(tmp_path):
 
 def start(folder, *flags: str) -> subprocess.Popen:
     """The program, copied beside the single file into a folder that holds nothing else."""
-    for module in (population, ppo_reg):
+    for module in (population, ppo_reg, ppo_reg_population):
         shutil.copy(module.__file__, folder)
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     command = [sys.executable, "ppo_reg_population.py", *FLAGS, "--num-agents=2", *flags]
@@ -511,22 +510,25 @@ def test_a_killed_process_continues_as_if_undisturbed(tmp_path):
     ],
 )
 def test_bad_flags_are_refused_by_name(monkeypatch, capsys, tmp_path, flags, message):
-    check_refusal(population, flags, message, monkeypatch, capsys, tmp_path)
+    check_refusal(ppo_reg_population, flags, message, monkeypatch, capsys, tmp_path)
 
 
 def test_one_agent_needs_no_placeholder(tmp_path):
-    args = population.Args(num_agents=1, agent=3, run_dir=tmp_path)
+    args = ppo_reg_population.Args(num_agents=1, agent=3, run_dir=tmp_path)
     assert [run.path for run in args.runs] == [tmp_path]
-    assert population.Args(num_agents=2).runs[1].path.name == "HopperBulletEnv-v0__ppo_reg__s1__a1"
+    assert (
+        ppo_reg_population.Args(num_agents=2).runs[1].path.name
+        == "HopperBulletEnv-v0__ppo_reg__s1__a1"
+    )
 
 
 @pytest.mark.slow
 def test_the_default_update_is_that_of_the_single_file():
     """400 steps of each network on 2000 states: what rounding makes of it stays below 1e-5."""
-    args = population.Args(num_agents=3)
+    args = ppo_reg_population.Args(num_agents=3)
     learners, rollouts = recorded(args)
     alone = copy.deepcopy(learners)
-    population.update(args, learners, rollouts)
+    ppo_reg_population.update(args, learners, rollouts)
     for i, run in enumerate(args.runs):
         ppo_reg.update(run, alone[i], rollouts[i])
         check_close(learners[i], alone[i], 1e-5)
@@ -536,8 +538,8 @@ def test_the_default_update_is_that_of_the_single_file():
 def test_it_learns(tmp_path):
     """An inverted pendulum is balanced for most of its 1000 steps; a random policy holds it ~30."""
     env_id, path = "InvertedPendulumBulletEnv-v0", tmp_path / "a{agent}"
-    population.train(
-        population.Args(env_id=env_id, total_timesteps=60_000, num_agents=3, run_dir=path)
+    ppo_reg_population.train(
+        ppo_reg_population.Args(env_id=env_id, total_timesteps=60_000, num_agents=3, run_dir=path)
     )
     for agent in range(3):
         rows = read_metrics(tmp_path / f"a{agent}")
