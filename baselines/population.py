@@ -223,14 +223,15 @@ class Stack:
 
     def __init__(self, networks: list[nn.Module]) -> None:
         self.networks = networks
-        shapes = [p.shape for p in networks[0].parameters()]
-        self.sizes = [shape.numel() for shape in shapes]
+        self.shapes = [p.shape for p in networks[0].parameters()]
+        self.sizes = [shape.numel() for shape in self.shapes]
         self.rows = torch.stack([parameters_to_vector(n.parameters()) for n in networks]).detach()
         self.grads = torch.zeros_like(self.rows)
-        self.leaves, self.gradients = (self.parts(x, shapes) for x in (self.rows, self.grads))
+        self.leaves, self.gradients = (self.parts(x) for x in (self.rows, self.grads))
 
-    def parts(self, rows: Tensor, shapes: list[torch.Size]) -> list[Tensor]:
-        parts = zip(rows.split(self.sizes, 1), shapes, strict=True)
+    def parts(self, rows: Tensor) -> list[Tensor]:
+        """Such rows as views `[N, ...]` in the parameters' shapes."""
+        parts = zip(rows.split(self.sizes, 1), self.shapes, strict=True)
         return [part.unflatten(1, shape) for part, shape in parts]
 
     def store(self) -> None:
@@ -340,7 +341,21 @@ def rollout(
 
 def by_agent(x: Tensor) -> Tensor:
     """`[T, N, E, ...]` to `[N, T · E, ...]`, each agent's steps in the single file's order."""
-    return x.transpose(0, 1).flatten(1, 2)
+    return x.transpose(0, 1).flatten(1, 2).contiguous()
+
+
+def flatten(args: PopulationArgs, rollouts: list[Any]) -> tuple[Tensor, ...]:
+    """Observations, actions, advantages and the critics' targets, `[N, B, ...]`.
+
+    And the critics' explained variance, `[N]`.
+    """
+    columns = [torch.stack(x, 1) for x in zip(*[r[:6] for r in rollouts], strict=True)]
+    data = args.single.Rollout(*columns, None, [], [])  # [T, N, E, ...]
+    advantages = by_agent(args.single.gae(data, args.gamma, args.gae_lambda))
+    obs, actions, values = (by_agent(x) for x in (data.obs, data.actions, data.values))
+    targets = advantages + values
+    explained = 1 - (targets - values).var(1) / targets.var(1)
+    return obs, actions, advantages, targets, explained
 
 
 def shuffled(args: PopulationArgs, learners: list[Any]) -> Tensor:
@@ -368,7 +383,7 @@ def value_step(args: PopulationArgs, critic: AdamStack, obs: Tensor, targets: Te
 
 def draw_delta(learners: list[Any], obs: Tensor, learns: np.ndarray) -> Tensor:  # condwrap
     """What the regularizers of learning agents would draw in turn, `[M, N, b, n]`."""  # condwrap
-    noise = torch.ones_like(obs)  # condwrap
+    noise = torch.ones(obs.shape, dtype=obs.dtype)  # condwrap
     for agent in np.flatnonzero(learns):  # condwrap
         for x in noise[:, agent]:  # condwrap
             x.normal_(generator=learners[agent].regularizer.generator)  # condwrap

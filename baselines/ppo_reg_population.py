@@ -44,23 +44,6 @@ class Batch(NamedTuple):
     targets: Tensor  # of the critic
 
 
-def make_batch(
-    args: Args, actor: population.AdamStack, rollouts: list[Any]
-) -> tuple[Batch, Tensor]:
-    """The agents' rollouts as one batch, and the critics' explained variance."""
-    columns = [torch.stack(x, 1) for x in zip(*[r[:6] for r in rollouts], strict=True)]
-    data = ppo_reg.Rollout(*columns, None, [], [])  # [T, N, E, ...]
-    advantages = population.by_agent(ppo_reg.gae(data, args.gamma, args.gae_lambda))
-    obs, actions, values = (population.by_agent(x) for x in (data.obs, data.actions, data.values))
-    targets = advantages + values
-    log_std, *layers = actor.leaves
-    logprobs, _ = population.log_prob(
-        population.forward(layers, obs, args.activation)[-1], log_std, actions
-    )
-    explained = 1 - (targets - values).var(1) / targets.var(1)
-    return Batch(obs, actions, logprobs, advantages, targets), explained
-
-
 def minibatches(args: Args, learners: list[Any], batch: Batch) -> Batch:
     """An epoch: `[minibatches, N, b, ...]`, advantages normalized."""
     order = population.shuffled(args, learners)
@@ -123,7 +106,10 @@ def update(args: Args, learners: list[Any], rollouts: list[Any]) -> list[dict[st
     critic = population.AdamStack(
         [x.critic for x in learners], [x.critic_optimizer for x in learners]
     )
-    batch, explained = make_batch(args, actor, rollouts)
+    obs, actions, *rest, explained = population.flatten(args, rollouts)
+    log_std, *layers = actor.leaves
+    means = population.forward(layers, obs, args.activation)[-1]
+    batch = Batch(obs, actions, population.log_prob(means, log_std, actions)[0], *rest)
     learns, epochs = np.ones(args.num_agents, bool), np.zeros(args.num_agents, int)
     logs, value_losses = [], []
     for epoch in range(max(args.update_epochs, args.vf_epochs)):
