@@ -2,7 +2,8 @@
 
 Environments that are normalized as the single file's wrappers would, networks whose parameters are
 stacked so that one call evaluates or steps all, rollouts, and a training loop that keeps for each
-agent the files of a single run. `args.single` is the single file's module.
+agent the files of a single run. Its `charts/SPS` counts the steps of all. `args.single` is the
+single file's module.
 """
 
 from __future__ import annotations
@@ -390,13 +391,15 @@ def draw_delta(learners: list[Any], obs: Tensor, learns: np.ndarray) -> Tensor: 
     return learners[0].regularizer.perturbation(noise)  # condwrap
 
 
-def penalty_slope(args: Any, output: Tensor, moved: Tensor, delta: Tensor) -> Tensor:  # condwrap
-    """Of mean(psi) in pi(S), `[N, b, m]`; in pi(S + delta) it is the opposite."""  # condwrap
-    quotient = conditioning_quotient(output, moved, delta, batch_ndim=2)  # condwrap
+def penalty_slope(args: Any, output: Tensor, delta: Tensor) -> Tensor:  # condwrap
+    """Of coefficient · mean(psi) in pi(S); in pi(S + delta) the opposite."""  # condwrap
+    clean, moved = output.split(delta.shape[1], 1)  # condwrap
+    quotient = conditioning_quotient(clean, moved, delta, batch_ndim=2)  # condwrap
     excess = quotient - quotient.clamp(args.lambda_min, args.lambda_max)  # condwrap
     # psi = excess², and dJ / d pi(S) = (pi(S) - pi(S + delta)) / (J ‖delta‖²)
-    slopes = 2 * excess / (quotient * delta.square().sum(-1)) / delta.shape[1]  # condwrap
-    return slopes.masked_fill_(quotient == 0, 0)[..., None] * (output - moved)  # condwrap
+    slopes = excess / (quotient * delta.square().sum(-1))  # condwrap
+    slopes *= 2 * args.coefficient / delta.shape[1]  # condwrap
+    return slopes.masked_fill_(quotient == 0, 0)[..., None] * (clean - moved)  # condwrap
 
 
 # --- training -------------------------------------------------------------------------------------

@@ -72,10 +72,7 @@ def policy_step(
     grad = slopes * scaled * (-log_std).exp()[:, None]
     torch.sum(slopes * (scaled.square() - 1), 1, out=actor.gradients[0]).sub_(args.ent_coef)
     if delta is not None:  # condwrap
-        slope = population.penalty_slope(
-            args, output[:, :size], output[:, size:], delta
-        )  # condwrap
-        slope *= args.coefficient  # condwrap
+        slope = population.penalty_slope(args, output, delta)  # condwrap
         grad = torch.cat([grad + slope, -slope], 1)  # condwrap
     before = logratio, log_std.clone()
     population.backward(actor, inputs, grad, args.activation)

@@ -105,9 +105,7 @@ class Problem:
         log_std_grad = self.actor.gradients[0]
         torch.sum(slopes * (self.scaled.square() - 1), 1, out=log_std_grad)
         if self.delta is not None:  # condwrap
-            outputs = self.means, self.output[:, self.size :]  # condwrap
-            slope = population.penalty_slope(self.args, *outputs, self.delta)  # condwrap
-            slope *= self.args.coefficient  # condwrap
+            slope = population.penalty_slope(self.args, self.output, self.delta)  # condwrap
             grad = torch.cat([grad - slope, slope], 1)  # condwrap
         population.backward(self.actor, self.inputs, grad, self.args.activation)
         return self.actor.grads.clone()
