@@ -518,10 +518,10 @@ def test_compiled_losses_are_those_of_eager_code(tmp_path, changes):
 
 @pytest.mark.slow
 def test_it_learns(tmp_path):
-    """Three easy levels, two of which random play solves once in twenty episodes."""
+    """Of three easy levels a random policy solves one in half of its episodes, the others never."""
     levels = {"num_levels": 3, "start_level": 6, "distribution_mode": "easy"}
     args = Args(
-        **levels, num_steps=128, num_minibatches=4, update_epochs=2, total_timesteps=100_000,
+        **levels, num_steps=128, num_minibatches=4, update_epochs=2, total_timesteps=150_000,
         probe_fraction=0.01, eval_interval=0, run_dir=tmp_path,
     )  # fmt: skip
 
@@ -532,5 +532,5 @@ def test_it_learns(tmp_path):
         return found["success"].mean()
 
     untrained = success_rate(Learner(args).agent)
-    assert untrained < 0.5
-    assert success_rate(train(args).agent) > untrained + 0.35
+    assert untrained < 0.25
+    assert success_rate(train(args).agent) > untrained + 0.3
