@@ -738,21 +738,19 @@ def measure_conditioning(args: Args, learner: Learner, obs: Tensor) -> dict[str,
 
 
 def evaluate(args: Args, learner: Learner) -> dict[str, float]:
-    """Success on training levels and on unseen ones, every `eval_interval` updates."""
+    """Success on training levels and on as many that follow them, every `eval_interval` updates."""
+    starts = {"eval/success_seen": args.start_level}
+    if args.num_levels:  # without bound, no level is unseen
+        starts["eval/success_unseen"] = args.start_level + args.num_levels
     rates = {"eval/success_seen": math.nan, "eval/success_unseen": math.nan}
     if args.eval_interval and learner.update % args.eval_interval == 0:
-        for name, start in zip(rates, (args.start_level, unseen(args)), strict=True):
+        for name, start in starts.items():
             env = make_env(args, args.eval_envs, start)
             seed = int(torch.randint(2**31, (), generator=learner.generators["eval"]))
             found = play(learner.agent, env, seed, learner.generators["eval"])
             rates[name] = float(found["success"].mean())
             env.close()
     return rates
-
-
-def unseen(args: Args) -> int:
-    """The first of as many levels again, none of which is trained on."""
-    return args.start_level + args.num_levels
 
 
 # --- state and files ------------------------------------------------------------------------------

@@ -407,6 +407,15 @@ def test_evaluation_is_on_disjoint_levels_and_only_when_it_is_due(tmp_path, monk
     assert len({seed for *_, seed in asked}) == 4
 
 
+def test_where_levels_have_no_bound_none_is_unseen(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        ppo_reg_coinrun, "play", lambda *_: {"success": np.array([True])}
+    )  # fmt: skip
+    train(coinrun(tmp_path, num_levels=0, eval_interval=1, eval_envs=1, total_timesteps=64))
+    row = read_metrics(tmp_path)[0]
+    assert (row["eval/success_seen"], row["eval/success_unseen"]) == ("1.0", "nan")
+
+
 def test_evaluation_changes_nothing_in_training(tmp_path):
     changes = {"total_timesteps": 128, "dropout": 0.1}
     plain = train(coinrun(tmp_path / "a", **changes))

@@ -8,8 +8,8 @@ from collections import Counter
 import pytest
 import tyro
 
-from harness.statistics import MIN_AGENTS
 from harness.schema import SuiteError, suite_names
+from harness.statistics import MIN_AGENTS
 from harness.suite import load_suite
 
 
