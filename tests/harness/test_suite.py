@@ -63,9 +63,21 @@ def test_counts_start_at_1(suite_file, flag):
         load_suite(str(suite_file), **{flag: 0})
 
 
-def test_it_does_not_scale_up_seeds_in_silence(suite_file):
-    with pytest.raises(SuiteError, match=r"has 2 seeds, fewer than 3"):
-        load_suite(str(suite_file), seeds=3)
+@pytest.mark.parametrize(
+    ("own", "count", "taken"),
+    [
+        ("[1, 2]", 1, [1]),
+        ("[1, 2]", 2, [1, 2]),
+        ("[1, 2]", 4, [1, 2, 3, 4]),
+        ("[7, 3]", 4, [7, 3, 8, 9]),
+    ],
+)
+def test_more_seeds_follow_the_largest_of_the_suites_own(suite_file, own, count, taken):
+    suite_file.write_text(suite_file.read_text().replace("[1, 2]", own))
+    suite = load_suite(str(suite_file), seeds=count, agents=1, env=("Hopper",))
+    seeds = [run.args["seed"] for run in suite.runs if run.algorithm == "PPO"]
+    assert seeds == taken
+    assert len(suite.runs) == 2 * count
 
 
 def test_table1_is_the_papers_plan():
@@ -94,7 +106,8 @@ def test_table1_is_the_papers_plan():
         ('"ppo_reg"\nargs', '"ppo"\nargs', "baseline 'ppo' cannot be imported"),
         ("[args]", "[args", "not valid TOML"),
         ("agents = 2\n", "", "needs the key 'agents'"),
-        ("[1, 2]", "[]", "no runs"),
+        ("[1, 2]", "[]", "seeds must not be empty"),
+        ("agents = 2", "agents = 0", "no runs"),
         ("[1, 2]", "[1, 1]", "must differ"),
         ("[1, 2]", "[-1]", "seed must be at least 0, got -1"),
         ("[1, 2]", "1", "seeds must be of type .*got 1"),
@@ -238,8 +251,9 @@ def test_every_suite_that_is_shipped_loads(name):
     assert {run.algorithm for run in suite.runs} == set(suite.algorithms)
 
 
-def test_the_shipped_suites_are_the_five_of_the_study():
-    assert suite_names() == ["ablation", "figure1", "smoke", "strong", "table1"]
+def test_the_shipped_suites_are_those_of_the_study():
+    control = ["ablation", "figure1", "smoke", "strong", "table1"]
+    assert suite_names() == sorted([*control, "figure4", "paper", "smoke_coinrun", "table2"])
 
 
 @pytest.mark.parametrize("name", ["table1", "strong"])
@@ -250,7 +264,7 @@ def test_a_suite_that_compares_has_the_agents_that_a_verdict_needs(name):
 
 @pytest.mark.parametrize("name", ["smoke", "strong", "table1"])
 def test_the_four_algorithms_of_the_paper_differ_by_baseline_and_coefficient(name):
-    runs = {run.algorithm: run for run in load_suite(name).runs}
+    runs = {run.algorithm: run for run in load_suite(name).runs if not run.evaluation}
     for plain, regularized in (("PPO", "PPO reg"), ("TRPO", "TRPO reg")):
         assert runs[plain].baseline == runs[regularized].baseline == f"{plain.lower()}_reg"
         without = {k: v for k, v in runs[plain].args.items() if k != "coefficient"}
@@ -271,7 +285,7 @@ def test_figure1_is_four_settings_of_plain_ppo_on_four_tasks():
 def test_smoke_holds_trpo_and_the_settings_of_figure_1():
     smoke, figure1 = load_suite("smoke"), load_suite("figure1")
     assert {"TRPO", "TRPO reg"} <= set(smoke.algorithms)
-    assert len(smoke.environments) == 8
+    assert smoke.environments == [*load_suite("table1").environments, "CoinRun"]
 
     def settings_of(suite):
         changed = ("gae_lambda", "gamma", "vf_coef", "vf_learning_rate", "vf_epochs", "coefficient")

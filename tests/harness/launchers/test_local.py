@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from harness.launchers.local import ROOT, command, run_local
+from harness.launchers.local import ROOT, commands, run_local
 from harness.progress import Progress
 from harness.store import Store
 from harness.suite import load_suite
@@ -64,7 +64,7 @@ def test_runs_finish_and_leave_what_the_store_promises(store, suite):
         assert store.steps(spec) == 200
         assert "update 2/2" in store.path(spec, "log.txt").read_text()
         written = json.loads(store.path(spec, "spec.json").read_text())
-        assert written["command"] == command(spec, store)
+        assert [written["command"]] == commands(spec, store)
 
 
 def test_a_failed_run_is_told_from_the_others(store, suite):

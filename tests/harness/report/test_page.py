@@ -13,7 +13,7 @@ import pytest
 from harness.report.claims import MIN_UPDATES, Claim, to_frame
 from harness.report.page import write_report
 from harness.report.results import Results, load_results
-from harness.report.table1 import Cell
+from harness.report.table1 import Cell, make_cells
 from harness.suite import load_suite
 from tests.harness.conftest import write_run
 from tests.harness.report.conftest import make_study
@@ -68,7 +68,7 @@ class Page(HTMLParser):
 
     def handle_data(self, data):
         self.texts.append(data)
-        if self.open and self.open[-1] == "h2":
+        if self.open and self.open[-1] in ("h2", "h3"):
             self.headings.append(data)
         if {"td", "th"} & set(self.open):
             self.cells[-1][-1] += data
@@ -82,7 +82,7 @@ class Page(HTMLParser):
 
 @pytest.fixture
 def report(store):
-    """Writes the report of some results, and gives its folder, findings and parsed page."""
+    """Writes the report of some results, and gives its folder, claims and parsed page."""
 
     def write(results):
         folder = store.report_path(results.suite.name)
@@ -113,9 +113,9 @@ def written(tmp_path_factory) -> Written:
     )  # fmt: skip
     report = folder / "report"
     report.mkdir()
-    cells, claims = write_report(results, report)
+    _, claims = write_report(results, report)
     page = Page((report / "report.html").read_text())
-    return Written(results, report, cells, claims, page)
+    return Written(results, report, make_cells(results), claims, page)
 
 
 def test_the_page_shows_every_figure_and_each_is_there(written):

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from harness.report.paper import paper_numbers
 from harness.report.results import load_results
 from harness.report.table1 import (
     make_cells,
     notes,
-    paper_numbers,
     to_frame,
     to_markdown,
     to_rich,
@@ -114,7 +114,7 @@ def test_the_terminal_shows_every_task(cells, results):
 
 
 def test_every_number_of_the_paper_is_there():
-    paper = paper_numbers()
+    paper = paper_numbers("table1")
     tasks = set(load_suite("table1").environments)
     for algorithm in ("PPO", "PPO reg", "TRPO", "TRPO reg"):
         assert set(paper[algorithm]) == tasks
