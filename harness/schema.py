@@ -36,9 +36,12 @@ def read(name: str) -> tuple[Path, dict[str, Any]]:
         data = tomllib.loads(path.read_text())
     except tomllib.TOMLDecodeError as error:
         raise SuiteError(f"{path} is not valid TOML: {error}") from error
-    needed = {"title"} if "include" in data and not RUNS & data.keys() else {"title", *RUNS}
-    check_keys(data, needed, KEYS, path.name)
+    if "include" in data and not RUNS & data.keys():
+        check_keys(data, {"title"}, {"title", "note", "include"}, path.name)
+    else:
+        check_keys(data, {"title", *RUNS}, KEYS, path.name)
     types_of = {"seeds": tuple[int, ...], "agents": int, "args": dict, "include": tuple[str, ...]}
+    types_of["evaluation"] = dict
     for key, hint in types_of.items():
         if key in data and not fits(data[key], hint):
             raise SuiteError(f"{path.name}: {key} must be of type {hint}, got {data[key]!r}")
