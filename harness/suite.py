@@ -109,8 +109,8 @@ def load_suite(
     path, data = read(name)
     included = [read(other) for other in data.get("include", [])]
     for other, its in included:
-        if "algorithms" not in its:
-            raise SuiteError(f"{path.name} includes {other.stem}, which has no runs of its own")
+        if "include" in its:
+            raise SuiteError(f"{path.name} includes {other.stem}, which includes others: name them")
     files = [(p, d) for p, d in [(path, data), *included] if "algorithms" in d]
     there = {environment for _, d in files for environment in d["environments"]}
     check_known(dict.fromkeys(env), there, "environment")
@@ -121,8 +121,7 @@ def load_suite(
     runs = list(found.values())  # what several suites have is run once, by the first of them
     if not runs:
         raise SuiteError(f"{path.name} has no runs: it needs algorithms, environments and seeds")
-    cells = {(r.algorithm, r.environment, r.args["seed"], r.args["agent"]) for r in runs}
-    if len(cells) < len(runs):
+    if len({run.run_id for run in runs}) < len(runs):
         raise SuiteError(f"{path.name}: names of algorithms and seeds must differ from each other")
     return Suite(
         name=path.stem,
