@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import importlib
+import json
 from collections import Counter
 
 import pytest
@@ -314,3 +317,170 @@ def test_the_ablation_sweeps_every_part_of_the_penalty():
     for run in suite.runs:
         if run.algorithm in suite.sweeps["noise augmentation"].values():
             assert (run.args["coefficient"], run.args["perturb_obs"]) == (0.0, True)
+
+
+def test_an_evaluation_is_of_every_run_and_in_its_hash(suite_file):
+    plain = load_suite(str(suite_file)).runs
+    suite_file.write_text(suite_file.read_text() + "\n[evaluation]\nlevels = 3\nrepeats = 2\n")
+    evaluated = load_suite(str(suite_file)).runs
+    assert all(run.evaluation == {"levels": 3, "repeats": 2} for run in evaluated)
+    assert all(run.evaluation == {} for run in plain)
+    assert [run.args for run in plain] == [run.args for run in evaluated]
+    assert not {run.hash for run in plain} & {run.hash for run in evaluated}
+    more = dataclasses.replace(evaluated[0], evaluation={"levels": 4, "repeats": 2})
+    assert more.hash != evaluated[0].hash
+
+
+def test_the_hash_of_a_run_that_is_not_evaluated_is_of_its_baseline_and_arguments(suite):
+    """Runs of the suites without levels, made before there were any, stay what they are."""
+    run = suite.runs[0]
+    content = json.dumps([run.baseline, run.args], sort_keys=True)
+    assert run.hash == hashlib.sha256(content.encode()).hexdigest()
+
+
+def including(tmp_path, names, own: str = "", name: str = "union") -> str:
+    path = tmp_path / f"{name}.toml"
+    path.write_text(f'title = "Union"\ninclude = {json.dumps(list(map(str, names)))}\n{own}')
+    return str(path)
+
+
+@pytest.fixture
+def other_file(tmp_path, suite_file):
+    """Shares PPO on Hopper with the tiny suite; TRPO, and Walker2D, are its own."""
+    path, text = tmp_path / "other.toml", suite_file.read_text()
+    text = text.replace('name = "PPO reg"\nbaseline = "ppo_reg"', TRPO_ALGORITHM)
+    path.write_text(text.replace("Reacher = ", "Walker2D = "))
+    return path
+
+
+TRPO_ALGORITHM = 'name = "TRPO"\nbaseline = "ppo_reg"\nargs = { coefficient = 0.5 }'
+
+
+def test_included_suites_are_one_union_of_runs_each_in_its_own_folder(
+    tmp_path, suite_file, other_file
+):
+    suite = load_suite(including(tmp_path, [suite_file, other_file]))
+    assert (suite.name, suite.title, suite.note) == ("union", "Union", "")
+    assert suite.algorithms == ["PPO", "PPO reg", "TRPO"]
+    assert suite.environments == ["Hopper", "Reacher", "Walker2D"]
+    first, second = load_suite(str(suite_file)), load_suite(str(other_file))
+    shared = [r for r in second.runs if (r.algorithm, r.environment) == ("PPO", "Hopper")]
+    assert len(shared) == 4
+    assert suite.runs == first.runs + [run for run in second.runs if run not in shared]
+    assert Counter(run.suite for run in suite.runs) == {"tiny": 16, "other": 12}
+
+
+def test_a_suites_own_runs_come_before_those_that_it_includes(tmp_path, suite_file, other_file):
+    other_file.write_text('include = ["' + str(suite_file) + '"]\n' + other_file.read_text())
+    suite = load_suite(str(other_file))
+    assert suite.name == "other"
+    assert Counter(run.suite for run in suite.runs) == {"other": 16, "tiny": 12}
+    ppo_on_hopper = [r for r in suite.runs if (r.algorithm, r.environment) == ("PPO", "Hopper")]
+    assert {run.suite for run in ppo_on_hopper} == {"other"}
+
+
+def test_a_union_scales_down_in_all_its_parts(tmp_path, suite_file, other_file):
+    name = including(tmp_path, [suite_file, other_file])
+    small = load_suite(name, total_timesteps=300, seeds=1, agents=1, env=("Walker2D", "Hopper"))
+    assert [run.run_id for run in small.runs] == [
+        "ppo__Hopper__s1__a0",
+        "ppo-reg__Hopper__s1__a0",
+        "ppo__Walker2D__s1__a0",
+        "trpo__Hopper__s1__a0",
+        "trpo__Walker2D__s1__a0",
+    ]
+    assert small.timesteps == 5 * 300
+    assert small.environments == ["Hopper", "Walker2D"]
+    assert {run.suite for run in load_suite(name, env=("Walker2D",)).runs} == {"other"}
+    with pytest.raises(SuiteError, match=r"environment 'Walker' is unknown: Walker2D\?"):
+        load_suite(name, env=("Walker",))
+
+
+def test_figures_and_sweeps_of_included_suites_are_there(tmp_path, suite_file, other_file):
+    added(suite_file, FIGURES)
+    added(other_file, SWEEP.replace('"Reacher"', '"Walker2D"'))
+    suite = load_suite(including(tmp_path, [suite_file, other_file]))
+    assert suite.figures == {"Both": ["PPO", "PPO reg"]}
+    assert list(suite.sweeps) == ["size of delta"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("num_steps = 100", "num_steps = 200"),  # other arguments: other runs of the same name
+        ('name = "TRPO"', 'name = "PPO-reg"'),  # another algorithm, whose runs are named alike
+    ],
+)
+def test_two_runs_of_one_name_are_refused(tmp_path, suite_file, other_file, old, new):
+    assert old in other_file.read_text()
+    other_file.write_text(other_file.read_text().replace(old, new))
+    with pytest.raises(SuiteError, match=r"union\.toml: names .* must differ"):
+        load_suite(including(tmp_path, [suite_file, other_file]))
+
+
+@pytest.mark.parametrize("own", ["", "as the tiny suite"])
+def test_what_includes_others_is_not_included(tmp_path, suite_file, other_file, own):
+    """Its own runs alone would pass for all of it."""
+    inner = including(tmp_path, [other_file], own, "inner") if not own else str(suite_file)
+    if own:
+        suite_file.write_text(f'include = ["{other_file}"]\n{suite_file.read_text()}')
+    with pytest.raises(SuiteError, match=r"union\.toml includes \w+, which includes others"):
+        load_suite(including(tmp_path, [inner]))
+
+
+def test_an_unknown_suite_is_not_included(tmp_path):
+    with pytest.raises(SuiteError, match="no suite 'tabel1'"):
+        load_suite(including(tmp_path, ["tabel1"]))
+    with pytest.raises(SuiteError, match=r"union\.toml has no runs"):
+        load_suite(including(tmp_path, []))
+
+
+def test_table2_is_the_papers_plan():
+    suite = load_suite("table2")
+    assert suite.environments == ["CoinRun"]
+    assert len(suite.runs) == 8
+    assert {run.args["total_timesteps"] for run in suite.runs} == {50_000_000}
+    assert all(run.evaluation == {"levels": 500, "repeats": 20} for run in suite.runs)
+    assert [run.run_id for run in load_suite("table2", seeds=3).runs[:3]] == [
+        "ppo__CoinRun__s1__a0",
+        "ppo__CoinRun__s2__a0",
+        "ppo__CoinRun__s3__a0",
+    ]
+
+
+@pytest.mark.parametrize("name", ["table2", "smoke_coinrun"])
+def test_the_eight_agents_are_four_with_and_without_the_penalty(name):
+    runs = {run.algorithm: run for run in load_suite(name).runs}
+    plain = {a: {} for a in ("PPO", "PPO-l2", "PPO-D", "PPO-IMP")}
+    plain["PPO-l2"], plain["PPO-D"] = {"l2": 1e-4}, {"dropout": 0.1}
+    plain["PPO-IMP"] = {"network": "impala"}
+    common = [k for k in runs["PPO"].args if k != "coefficient"]
+    for algorithm, special in plain.items():
+        without, reg = runs[algorithm].args, runs[f"{algorithm} reg"].args
+        assert without == reg | {"coefficient": 0.0}
+        assert "coefficient" not in reg
+        assert {k: v for k, v in reg.items() if k not in common} == special
+    assert list(runs) == [x for a in plain for x in (a, f"{a} reg")]
+
+
+def test_the_paper_is_both_tables_and_figure_1_each_run_once():
+    paper = load_suite("paper")
+    assert len(paper.runs) == 1328  # 960, 360 of the settings 2 to 4 of figure 1, and 8
+    assert Counter(run.suite for run in paper.runs) == {"table1": 960, "figure1": 360, "table2": 8}
+    parts = [load_suite(name) for name in ("table1", "figure1", "table2")]
+    hashes = {run.hash for part in parts for run in part.runs}
+    assert {run.hash for run in paper.runs} == hashes
+    assert len(hashes) == 1328
+    assert paper.figures == parts[0].figures | parts[1].figures
+    assert load_suite("paper", env=("CoinRun",)).runs == parts[2].runs
+
+
+def test_the_runs_of_figure4_are_table2s():
+    assert load_suite("figure4").runs == load_suite("table2").runs
+
+
+def test_smoke_holds_the_eight_agents_of_coinrun():
+    runs = [run for run in load_suite("smoke").runs if run.environment == "CoinRun"]
+    assert runs == load_suite("smoke_coinrun").runs
+    assert {run.suite for run in runs} == {"smoke_coinrun"}
+    assert [run.algorithm for run in runs] == load_suite("table2").algorithms
