@@ -96,7 +96,8 @@ class Store:
         self.path(spec).mkdir(parents=True, exist_ok=True)
         self.path(spec, "failed.json").unlink(missing_ok=True)
         content = {"hash": spec.hash, "baseline": spec.baseline, "args": spec.args}
-        content |= {"command": command, "agents": [run.args["agent"] for run in group]}
+        content |= {"evaluation": spec.evaluation, "command": command}
+        content["agents"] = [run.args["agent"] for run in group]
         write_json(self.path(spec, "spec.json"), content)
         if spec != group[0]:
             about = f"trained together with {group[0].run_id}, whose log.txt has what was said\n"
@@ -179,7 +180,7 @@ def read_json(path: Path) -> dict[str, Any] | None:
 
 
 def _difference(saved: dict[str, Any], spec: RunSpec) -> str:
-    old, new = saved["args"], spec.args
+    old, new = saved["args"] | saved.get("evaluation", {}), spec.args | spec.evaluation
     names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
     changes = [f"{name} {old.get(name)} -> {new.get(name)}" for name in names]
     return ", ".join(changes) or f"baseline {saved['baseline']} -> {spec.baseline}"
