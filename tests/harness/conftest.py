@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from baselines import ppo_reg_coinrun
 from harness.store import Store
 from harness.suite import RunSpec, Suite, load_suite
 
@@ -64,6 +65,7 @@ def write_run(
     psi: float | Sequence[float] = 0.5,
     *,
     columns: dict[str, Sequence[float]] | None = None,
+    episodes: pd.DataFrame | None = None,
     done: bool = True,
 ) -> None:
     """What a run leaves behind, with these mean returns and psi of its updates.
@@ -74,6 +76,7 @@ def write_run(
         returns: Mean return of each update; NaN where no episode ended.
         psi: The same for psi, or one value for all.
         columns: More columns of its metrics.
+        episodes: What it did on levels, if it was evaluated: see `make_episodes`.
         done: Whether it came to its end.
     """
     store.start(spec, ["true"])
@@ -89,5 +92,60 @@ def write_run(
     )
     metrics.to_csv(store.path(spec, "metrics.csv"), index=False)
     store.path(spec, "checkpoint.pt").write_bytes(b"weights")
+    if episodes is not None:
+        episodes.to_csv(store.path(spec, "evaluation.csv"), index=False)
     if done:
         store.finish(spec, returncode=0, seconds=1.0)
+
+
+def make_episodes(**successes: Sequence[Sequence[float]]) -> pd.DataFrame:
+    """Episodes with these successes, `[levels, repeats]`, each named like seen_sampled."""
+    rows = []
+    for name, matrix in successes.items():
+        split, policy = name.split("_")
+        first = 0 if split == "seen" else 500
+        rows += [
+            (split, first + level, policy, repeat, int(success), 10.0 * success, 100)
+            for level, row in enumerate(matrix)
+            for repeat, success in enumerate(row)
+        ]
+    columns = ["split", "level", "policy", "repeat", "success", "return", "length"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+COINRUN = """
+title = "Toy CoinRun"
+seeds = [1]
+agents = 1
+
+[args]
+total_timesteps = 16
+num_envs = 2
+num_steps = 8
+num_minibatches = 2
+update_epochs = 1
+eval_interval = 0
+device = "cpu"
+
+[evaluation]
+levels = 1
+repeats = 1
+
+[[algorithms]]
+name = "PPO"
+baseline = "ppo_reg_coinrun"
+args = { coefficient = 0.0, dropout = 0.5 }
+
+[environments]
+CoinRun = "coinrun"
+"""
+
+
+@pytest.fixture(scope="session")
+def coinrun_run(tmp_path_factory) -> tuple[Path, RunSpec]:
+    """A real CoinRun agent after its one update, and what it is in a suite."""
+    folder = tmp_path_factory.mktemp("coinrun")
+    (folder / "toy.toml").write_text(COINRUN)
+    spec = load_suite(str(folder / "toy.toml")).runs[0]
+    ppo_reg_coinrun.train(ppo_reg_coinrun.Args(**spec.args, run_dir=folder / "run", num_threads=1))
+    return folder / "run", spec

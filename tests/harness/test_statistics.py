@@ -13,13 +13,16 @@ from harness.statistics import (
     MIN_AGENTS,
     Estimate,
     estimate_mean,
+    estimate_success,
     final_score,
     interquartile_mean,
     interval_of_means,
     rank_correlation,
     spearman,
+    success_matrix,
     verdict,
 )
+from tests.harness.conftest import make_episodes
 
 
 def test_the_final_score_is_the_mean_of_the_last_updates_in_which_an_episode_ended():
@@ -279,3 +282,91 @@ def test_below_ten_agents_there_is_no_verdict():
     estimate = Estimate(1.0, 0.9, 1.1, 10)
     assert verdict(estimate, +1) == "supported"
     assert verdict(estimate._replace(n=9), +1) == "too few runs to tell"
+
+
+def test_successes_stand_at_their_level_and_repeat():
+    matrix = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 1.0]])
+    episodes = make_episodes(seen_sampled=matrix)
+    np.testing.assert_array_equal(success_matrix(episodes), matrix)
+    np.testing.assert_array_equal(success_matrix(episodes.sample(frac=1, random_state=1)), matrix)
+    greedy = success_matrix(make_episodes(seen_greedy=[[1], [0], [1]]))
+    np.testing.assert_array_equal(greedy, [[1.0], [0.0], [1.0]])
+
+
+def test_an_episode_that_counts_twice_is_refused():
+    episodes = make_episodes(seen_sampled=[[1.0, 0.0]])
+    with pytest.raises(ValueError, match="duplicate"):
+        success_matrix(pd.concat([episodes, episodes]))
+
+
+@pytest.mark.parametrize(
+    ("agents", "mean"),
+    [
+        ([[[1, 1, 0, 0], [1, 0, 0, 0]]], (0.5 + 0.25) / 2),
+        ([[[1], [0], [0], [0]]], 0.25),
+        ([[[1, 1], [1, 1]], [[0, 0], [0, 1]]], (1 + 0.25) / 2),
+        ([[[1, 0]], [[1, 1]], [[0, 0]]], 0.5),
+    ],
+)
+def test_the_success_rate_by_hand(agents, mean):
+    estimate = estimate_success([np.array(matrix, float) for matrix in agents])
+    assert estimate.mean == pytest.approx(mean)
+    assert 0 <= estimate.low <= mean <= estimate.high <= 1
+    assert estimate.n == len(agents)
+
+
+def test_no_agent_has_no_success_rate():
+    np.testing.assert_equal(estimate_success([]), (np.nan, np.nan, np.nan, 0))
+
+
+@pytest.mark.parametrize("agents", [1, 3])
+@pytest.mark.parametrize("rate", [0.0, 1.0])
+def test_levels_that_are_all_alike_and_sure_leave_no_doubt(agents, rate):
+    estimate = estimate_success([np.full((4, 5), rate)] * agents)
+    assert estimate == (rate, rate, rate, agents)
+
+
+@pytest.mark.parametrize("shape", [(100, 1), (10, 10)])
+def test_the_interval_of_one_agent_is_the_binomial_one_where_levels_are_alike(shape):
+    """100 levels, half of them won; or 10 levels, each won in half of 10 repeats."""
+    wins = np.tile([1.0, 0.0], 50).reshape(shape)
+    mean, low, high, _ = estimate_success([wins])
+    assert mean == 0.5
+    assert (low, high) == pytest.approx(stats.binom.ppf([0.025, 0.975], 100, 0.5) / 100, abs=0.02)
+
+
+def test_repeats_of_few_levels_do_not_narrow_the_interval_at_will():
+    """Two levels, one always won: 1000 repeats say nothing of a third."""
+    estimate = estimate_success([np.repeat([[1.0], [0.0]], 1000, axis=1)])
+    assert estimate == (0.5, 0.0, 1.0, 1)
+
+
+def test_levels_are_resampled_alike_for_all_agents():
+    """20 agents that win the same 50 of 100 levels know of no more levels than one of them."""
+    wins = np.tile([1.0, 0.0], 50).reshape(100, 1)
+    one, many = estimate_success([wins]), estimate_success([wins] * 20)
+    assert many.n == 20
+    assert (many.low, many.high) == pytest.approx((one.low, one.high), abs=0.03)
+
+
+def test_agents_are_resampled():
+    """Each agent is sure of itself, so all doubt is in which agents there are."""
+    rates = [0.0, 0.0, 1.0, 1.0]
+    _, low, high, _ = estimate_success([np.full((50, 2), rate) for rate in rates])
+    assert (low, high) == (0.0, 1.0)  # all four alike: 2 in 16 resamples, above 5 in 100
+
+
+def test_an_estimate_of_success_is_the_same_each_time():
+    wins = np.random.default_rng(1).integers(2, size=(3, 20, 4)).astype(float)
+    assert estimate_success(list(wins)) == estimate_success(list(wins))
+
+
+def test_the_interval_of_a_success_rate_covers_the_truth_19_times_in_20():
+    """Agents and levels differ, around a success rate of 1/2 by symmetry."""
+    rng, covered = np.random.default_rng(10), 0
+    for _ in range(40):
+        logits = rng.normal(size=(12, 1, 1)) + rng.normal(size=(1, 30, 1))
+        wins = rng.random((12, 30, 5)) < 1 / (1 + np.exp(-logits))
+        _, low, high, _ = estimate_success(list(wins.astype(float)))
+        covered += low <= 0.5 <= high
+    assert covered >= 35

@@ -10,7 +10,7 @@ import threading
 import pytest
 
 from harness.store import StoreError, write_json
-from tests.harness.conftest import write_run
+from tests.harness.conftest import make_episodes, write_run
 
 
 def test_a_run_goes_from_pending_to_done(store, suite):
@@ -71,6 +71,44 @@ def test_another_configuration_is_not_taken_for_a_finished_run(store, suite):
     store.refuse_changed(spec)
     with pytest.raises(StoreError, match=r"gamma None -> 0\.9.*--results-dir"):
         store.refuse_changed(changed)
+
+
+def test_another_evaluation_is_another_configuration_and_is_named(store, suite):
+    spec = dataclasses.replace(suite.runs[0], evaluation={"levels": 2, "repeats": 3})
+    episodes = make_episodes(seen_sampled=[[1.0]])
+    write_run(store, spec, [1.0], episodes=episodes)
+    assert store.state(spec) == "done"
+    assert json.loads(store.path(spec, "spec.json").read_text())["evaluation"] == spec.evaluation
+    other = dataclasses.replace(spec, evaluation={"levels": 5, "repeats": 3})
+    with pytest.raises(StoreError, match=r"another configuration \(levels 2 -> 5\)"):
+        store.refuse_changed(other)
+    with pytest.raises(StoreError, match=r"\(levels 2 -> None, repeats 3 -> None\)"):
+        store.refuse_changed(suite.runs[0])
+
+
+def test_another_baseline_is_named(store, suite):
+    write_run(store, suite.runs[0], [1.0])
+    other = dataclasses.replace(suite.runs[0], baseline="trpo_reg")
+    with pytest.raises(StoreError, match=r"\(baseline ppo_reg -> trpo_reg\)"):
+        store.refuse_changed(other)
+
+
+def test_a_run_is_done_when_it_is_evaluated_too(store, suite):
+    spec = dataclasses.replace(suite.runs[0], evaluation={"levels": 1, "repeats": 1})
+    write_run(store, spec, [1.0], done=False)
+    with pytest.raises(FileNotFoundError, match=r"evaluation\.csv"):
+        store.finish(spec, returncode=0, seconds=1.0)
+    assert store.state(spec) == "interrupted"
+    write_run(store, spec, [1.0], episodes=make_episodes(seen_sampled=[[1.0]]))
+    done = json.loads(store.path(spec, "done.json").read_text())
+    content = store.path(spec, "evaluation.csv").read_bytes()
+    assert done["sha256"]["evaluation.csv"] == hashlib.sha256(content).hexdigest()
+
+
+def test_a_run_that_is_not_evaluated_has_no_checksum_of_it(store, suite):
+    write_run(store, suite.runs[0], [1.0])
+    done = json.loads(store.path(suite.runs[0], "done.json").read_text())
+    assert list(done["sha256"]) == ["metrics.csv", "checkpoint.pt"]
 
 
 def test_checksums_are_of_the_files(store, suite):
