@@ -1,0 +1,443 @@
+"""Evaluation: which levels, each as often as the others, a real agent's episodes, its files."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from baselines.ppo_reg_coinrun import Agent, Args, make_env
+from harness import evaluate
+from harness.evaluate import (
+    COLUMNS,
+    Levels,
+    choose_levels,
+    evaluate_levels,
+    evaluate_run,
+    load_agent,
+    record,
+)
+from harness.store import EvaluationError
+
+ARGS = Args(num_levels=10, start_level=5, dropout=0.5)
+
+
+# --- which levels ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("count", "seen", "unseen"),
+    [
+        (10, list(range(5, 15)), list(range(15, 25))),
+        (3, [5, 8, 11], [15, 18, 21]),
+        (1, [5], [15]),
+    ],
+)
+def test_levels_are_evenly_spaced_in_the_training_set_and_after_it(count, seen, unseen):
+    assert choose_levels(ARGS, count, "next") == {"seen": seen, "unseen": unseen}
+
+
+def test_by_default_they_are_all_500_and_the_500_after_them():
+    chosen = choose_levels(Args(), 500, "next")
+    assert chosen == {"seen": list(range(500)), "unseen": list(range(500, 1000))}
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.integers(1, 60), st.integers(0, 100), st.floats(0, 1), st.sampled_from(["next", "unbounded"])
+)
+def test_no_unseen_level_was_trained_on_and_none_counts_twice(levels, start, share, unseen):
+    args = dataclasses.replace(ARGS, num_levels=levels, start_level=start)
+    count = 1 + int(share * (levels - 1))
+    chosen = choose_levels(args, count, unseen)
+    trained = set(range(start, start + levels))
+    assert set(chosen["seen"]) <= trained
+    assert not set(chosen["unseen"]) & trained
+    assert [len(set(some)) for some in chosen.values()] == [count, count]
+
+
+def test_unbounded_levels_are_drawn_again_where_they_were_trained_on(monkeypatch):
+    monkeypatch.setattr(evaluate, "MAX_SEED", 30)  # 10 of 30 are trained on
+    unseen = choose_levels(ARGS, 10, "unbounded")["unseen"]
+    assert len(set(unseen)) == 10
+    assert set(unseen) <= set(range(5)) | set(range(15, 30))
+
+
+def test_the_unbounded_draw_is_set_by_its_seed():
+    unseen = [choose_levels(ARGS, 5, "unbounded", seed)["unseen"] for seed in (0, 0, 1)]
+    assert unseen[0] == unseen[1] != unseen[2]
+    assert max(unseen[0]) > 10**6
+
+
+@pytest.mark.parametrize(
+    ("changed", "count", "unseen", "message"),
+    [
+        ({}, 11, "next", "levels must be from 1 to 10, got 11"),
+        ({}, 0, "next", "levels must be from 1 to 10, got 0"),
+        ({"num_levels": 0}, 5, "next", "levels without bound: none is unseen"),
+        ({}, 5, "later", "unseen must be next or unbounded, got 'later'"),
+    ],
+)
+def test_levels_that_cannot_be_had_are_refused(changed, count, unseen, message):
+    with pytest.raises(EvaluationError, match=message):
+        choose_levels(dataclasses.replace(ARGS, **changed), count, unseen)
+
+
+# --- several levels side by side ------------------------------------------------------------------
+
+
+class OneLevel:
+    """An engine of our own: level L's episodes last L, L + 1, ... steps; even levels are won."""
+
+    single_observation_space = gym.spaces.Box(0, 255, (3, 64, 64), np.uint8)
+    single_action_space = gym.spaces.Discrete(15)
+
+    def __init__(self, args: Args, num_envs: int, level: int) -> None:
+        assert args.num_levels == 1
+        self.metadata: dict = {}
+        self.level, self.num_envs, self.closed = level, num_envs, False
+
+    def reset(self, seed: int) -> tuple:
+        self.steps, self.actions = 0, []
+        return self.frames(), {}
+
+    def frames(self) -> np.ndarray:
+        frames = np.zeros((self.num_envs, 3, 64, 64), np.uint8)
+        frames[:, 0], frames[:, 1, :8, :8] = self.level, 80 * (self.steps % 3)
+        return frames
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self.actions.append(actions)
+        self.steps += 1
+
+    def step_wait(self) -> tuple:
+        lengths = self.level + np.arange(self.num_envs)
+        ended = self.steps % lengths == 0
+        info: dict = {"reset": np.zeros(self.num_envs, bool)}
+        if ended.any():
+            won = np.full(self.num_envs, self.level % 2 == 0)
+            info |= {"episode": {"r": 10.0 * won, "l": np.full(self.num_envs, self.steps)}}
+            info |= {"success": won, "level_seed": np.full(self.num_envs, self.level)}
+            info["_episode"] = ended
+        return self.frames(), np.zeros(self.num_envs), ended, np.zeros_like(ended), info
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@pytest.fixture
+def own_engine(monkeypatch):
+    monkeypatch.setattr(evaluate, "make_env", OneLevel)
+
+
+@pytest.fixture
+def agent() -> Agent:
+    made = Agent(ARGS, torch.Generator().manual_seed(0))
+    made.mask.zero_()  # with dropout on, it would see nothing
+    return made
+
+
+@pytest.mark.usefixtures("own_engine")
+def test_frames_and_infos_are_in_the_order_of_the_levels():
+    env = Levels(ARGS, [4, 2, 3], repeats=2)
+    frames, _ = env.reset(seed=0)
+    assert env.num_envs == 6
+    assert frames.shape == env.observation_space.shape
+    assert frames[:, 0, 0, 0].tolist() == [4, 4, 2, 2, 3, 3]
+    actions = np.arange(6)
+    assert env.step(actions)[-1] == {}
+    _, _, ended, _, info = env.step(actions)
+    assert [e.actions[0].tolist() for e in env.envs] == [[0, 1], [2, 3], [4, 5]]
+    assert ended.tolist() == info["_episode"].tolist() == [False, False, True, False, False, False]
+    assert (info["success"][2], info["level_seed"][2]) == (1, 2)
+    assert (info["episode"]["r"][2], info["episode"]["l"][2]) == (10.0, 2)
+    _, _, ended, _, info = env.step(actions)
+    assert ended.tolist() == info["_episode"].tolist() == [False, False, False, True, True, False]
+    assert info["level_seed"][[3, 4]].tolist() == [2, 3]
+    assert info["success"][[3, 4]].tolist() == [1, 0]
+    env.close()
+    assert all(e.closed for e in env.envs)
+
+
+def test_the_engine_shows_each_level_in_its_place():
+    env = Levels(ARGS, [7, 3], repeats=2)
+    frames, _ = env.reset(seed=0)
+    env.close()
+    for first, level in ((0, 7), (2, 3)):
+        alone = make_env(dataclasses.replace(ARGS, num_levels=1), 1, level)
+        np.testing.assert_array_equal(
+            frames[first : first + 2], alone.reset(seed=9)[0].repeat(2, 0)
+        )
+        alone.close()
+    assert (frames[0] != frames[2]).any()
+
+
+@pytest.mark.usefixtures("own_engine")
+def test_each_level_has_its_repeats_and_a_greedy_episode_and_only_first_ones_count(
+    agent, monkeypatch
+):
+    monkeypatch.setattr(evaluate, "POOLS", 2)
+    parts = list(evaluate_levels(agent, ARGS, [4, 1, 3], repeats=3))
+    assert len(parts) == 4  # two levels and one, sampled and greedy
+    episodes = pd.concat(parts)
+    assert len(episodes) == 3 * (3 + 1)
+    for level in (4, 1, 3):
+        sampled = episodes[(episodes["level"] == level) & (episodes["policy"] == "sampled")]
+        assert sampled["repeat"].tolist() == [0, 1, 2]
+        assert sampled["length"].tolist() == [level, level + 1, level + 2]
+        greedy = episodes[(episodes["level"] == level) & (episodes["policy"] == "greedy")]
+        assert greedy[["repeat", "length"]].to_numpy().tolist() == [[0, level]]
+        both = pd.concat([sampled, greedy])
+        assert set(both["success"]) == {level % 2 == 0}
+        assert set(both["return"]) == {10.0 * (level % 2 == 0)}
+
+
+@pytest.mark.usefixtures("own_engine")
+def test_sampled_actions_differ_and_greedy_ones_are_the_likeliest(agent, monkeypatch):
+    chosen = []
+    step_async = OneLevel.step_async
+    monkeypatch.setattr(
+        OneLevel, "step_async", lambda e, a: (chosen.append(np.array(a)), step_async(e, a))
+    )
+    list(evaluate_levels(agent, ARGS, [3], repeats=20))
+    sampled, greedy = chosen[0], chosen[-3]  # its episode has 3 steps
+    assert len(set(sampled.tolist())) > 5  # an agent that knows nothing: 15 actions alike
+    frames = torch.tensor(Levels(ARGS, [3], 1).reset(seed=0)[0])
+    assert greedy.tolist() == agent.eval()(frames)[0].argmax(-1).tolist()
+    again = len(chosen)
+    list(evaluate_levels(agent, ARGS, [3], repeats=20))
+    np.testing.assert_array_equal(np.concatenate(chosen[:again]), np.concatenate(chosen[again:]))
+
+
+@pytest.mark.usefixtures("own_engine")
+def test_dropout_is_off_while_an_agent_is_judged_and_shown(agent, monkeypatch, tmp_path):
+    training, forward = [], Agent.forward
+    monkeypatch.setattr(
+        Agent, "forward", lambda a, x: (training.append(a.training), forward(a, x))[1]
+    )
+    agent.train()
+    list(evaluate_levels(agent, ARGS, [2], repeats=2))
+    judged = len(training)
+    agent.train()
+    record(agent, ARGS, 3, tmp_path / "seen.gif")
+    assert judged >= 3 + 2
+    assert len(training) == judged + 3
+    assert not any(training)
+
+
+@pytest.mark.usefixtures("own_engine")
+def test_an_engine_that_plays_another_level_is_found_out(agent, monkeypatch):
+    class Other(OneLevel):
+        def step_wait(self):
+            *results, info = super().step_wait()
+            info |= {"level_seed": info["level_seed"] + 1} if "level_seed" in info else {}
+            return *results, info
+
+    monkeypatch.setattr(evaluate, "make_env", Other)
+    with pytest.raises(AssertionError, match="other levels than it was asked for"):
+        list(evaluate_levels(agent, ARGS, [2], repeats=1))
+
+
+@pytest.mark.usefixtures("own_engine")
+@pytest.mark.parametrize(("level", "frames"), [(3, 3), (50, 10)])
+def test_a_gif_ends_with_the_episode_or_at_its_longest(agent, monkeypatch, tmp_path, level, frames):
+    monkeypatch.setattr(evaluate, "GIF_FRAMES", 10)
+    record(agent, ARGS, level, tmp_path / "seen.gif")
+    with Image.open(tmp_path / "seen.gif") as picture:
+        assert (picture.format, picture.size, picture.n_frames) == ("GIF", (256, 256), frames)
+
+
+# --- a run ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def evaluated(coinrun_run, tmp_path_factory) -> tuple[Path, pd.DataFrame]:
+    """A real agent on two levels of each kind, twice: the folder, and what was found."""
+    path = tmp_path_factory.mktemp("evaluated") / "run"
+    shutil.copytree(coinrun_run[0], path)
+    return path, evaluate_run(path, levels=2, repeats=2, unseen="next", device="cpu")
+
+
+def test_a_real_agent_plays_every_level_as_often(evaluated):
+    _, episodes = evaluated
+    assert list(episodes.columns) == COLUMNS
+    counts = episodes.groupby(["split", "level", "policy"]).size().to_dict()
+    levels = {"seen": (0, 250), "unseen": (500, 750)}
+    assert counts == {
+        (split, level, policy): times
+        for split, some in levels.items()
+        for level in some
+        for policy, times in (("sampled", 2), ("greedy", 1))
+    }
+    assert set(episodes["success"]) <= {0, 1}
+    assert episodes["length"].between(1, 1000).all()
+    assert (episodes["return"] == 10 * episodes["success"]).all()
+
+
+def test_what_a_real_agent_did_is_written(evaluated):
+    path, episodes = evaluated
+    pd.testing.assert_frame_equal(pd.read_csv(path / "evaluation.csv"), episodes)
+    about = json.loads((path / "evaluation.json").read_text())
+    assert (about["levels"], about["repeats"], about["unseen"]) == (2, 2, "next")
+    assert not list(path.glob("*.tmp"))
+    for split in ("seen", "unseen"):
+        with Image.open(path / f"{split}.gif") as picture:
+            assert picture.n_frames > 1
+
+
+class Quick:
+    """Stands in for playing: a row for each level and policy, and how often it was asked."""
+
+    def __init__(self, monkeypatch) -> None:
+        self.calls: list[list[int]] = []
+        self.recorded: list[tuple[str, int]] = []
+        monkeypatch.setattr(evaluate, "evaluate_levels", self.play)
+        monkeypatch.setattr(evaluate, "record", self.record)
+
+    def play(self, agent, args, levels, repeats):
+        self.calls.append(levels)
+        for policy, times in (("sampled", repeats), ("greedy", 1)):
+            places = {"level": np.repeat(levels, times), "repeat": [*range(times)] * len(levels)}
+            found = {"success": True, "return": 10.0, "length": 7}
+            yield pd.DataFrame({**places, "policy": policy, **found})
+
+    def record(self, agent, args, level, path):
+        self.recorded.append((path.name, level))
+
+
+@pytest.fixture
+def quick(monkeypatch) -> Quick:
+    return Quick(monkeypatch)
+
+
+@pytest.fixture
+def path(coinrun_run, tmp_path) -> Path:
+    """A copy of the trained run."""
+    return Path(shutil.copytree(coinrun_run[0], tmp_path / "run"))
+
+
+def judge(path: Path, levels: int = 2, repeats: int = 2, unseen: str = "next") -> pd.DataFrame:
+    return evaluate_run(path, levels, repeats, unseen, "cpu")
+
+
+def test_a_second_call_reads_what_the_first_found(path, quick):
+    first = judge(path)
+    assert quick.calls == [[0, 250], [500, 750]]
+    assert quick.recorded == [("seen.gif", 0), ("unseen.gif", 500)]
+    pd.testing.assert_frame_equal(judge(path), first)
+    assert len(quick.calls) == 2
+
+
+@pytest.mark.parametrize("changed", [{"levels": 3}, {"repeats": 1}, {"unseen": "unbounded"}])
+def test_other_settings_are_played(path, quick, changed):
+    judge(path)
+    judge(path, **changed)
+    assert len(quick.calls) == 4
+    pd.testing.assert_frame_equal(judge(path, **changed), pd.read_csv(path / "evaluation.csv"))
+    assert len(quick.calls) == 4
+
+
+def test_another_checkpoint_is_played(path, quick):
+    judge(path)
+    saved = torch.load(path / "checkpoint.pt", weights_only=True)
+    saved["learner"]["agent"]["policy.bias"] += 1
+    torch.save(saved, path / "checkpoint.pt")
+    judge(path)
+    assert len(quick.calls) == 4
+
+
+def test_what_is_killed_before_its_last_file_is_played_again(path, quick, monkeypatch):
+    judge(path)
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(evaluate, "write_json", killed)
+        with pytest.raises(KeyboardInterrupt):
+            judge(path, repeats=1)
+    assert not (path / "evaluation.json").exists()
+    assert len(judge(path, repeats=2)) == 2 * 2 * 3  # not what the killed one has left
+    assert len(quick.calls) == 6
+
+
+def test_what_is_killed_while_it_plays_leaves_what_was_there(path, quick, monkeypatch):
+    before = judge(path)
+    with monkeypatch.context() as patch:
+        patch.setattr(evaluate, "record", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            judge(path, repeats=1)
+    pd.testing.assert_frame_equal(judge(path), before)
+    assert len(quick.calls) == 4
+
+
+def test_it_shows_how_far_it_is(path, quick, monkeypatch):
+    monkeypatch.setattr(evaluate, "POOLS", 500)
+    totals = []
+
+    def show(parts, total):
+        parts = list(parts)
+        totals.append((len(parts), total))
+        return parts
+
+    evaluate_run(path, 3, 1, "next", "cpu", show)
+    assert totals == [(4, 4)]
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"repeats": 0}, "repeats must be at least 1, got 0"),
+        ({"levels": 501}, "levels must be from 1 to 500, got 501"),
+    ],
+)
+def test_bad_settings_are_refused(path, changed, message):
+    with pytest.raises(EvaluationError, match=message):
+        judge(path, **changed)
+    assert not (path / "evaluation.json").exists()
+
+
+def test_a_run_without_checkpoint_is_refused(tmp_path):
+    with pytest.raises(EvaluationError, match=r"holds no checkpoint\.pt: train it first"):
+        judge(tmp_path)
+
+
+@pytest.mark.parametrize("kept", [0, 100, 5000])
+def test_a_torn_checkpoint_is_refused(path, kept):
+    content = (path / "checkpoint.pt").read_bytes()
+    (path / "checkpoint.pt").write_bytes(content[:kept])
+    with pytest.raises(EvaluationError, match=r"checkpoint\.pt cannot be read"):
+        judge(path)
+
+
+def test_the_checkpoint_of_another_baseline_is_refused(tmp_path):
+    args = {"env_id": "HopperBulletEnv-v0", "seed": 1, "hidden_sizes": (64, 64)}
+    torch.save({"args": args, "learner": {}}, tmp_path / "checkpoint.pt")
+    with pytest.raises(EvaluationError, match="is not of ppo_reg_coinrun"):
+        judge(tmp_path)
+
+
+def test_a_device_that_is_not_there_is_refused(path):
+    with pytest.raises(EvaluationError, match="device cuda:99 cannot be used"):
+        evaluate_run(path, 2, 2, "next", "cuda:99")
+
+
+def test_the_agent_is_the_one_that_was_trained(path, coinrun_run):
+    agent, args = load_agent(path / "checkpoint.pt", "cpu")
+    spec = coinrun_run[1]
+    assert {name: getattr(args, name) for name in spec.args} == spec.args
+    saved = torch.load(path / "checkpoint.pt", weights_only=True)["learner"]["agent"]
+    assert saved.keys() == agent.state_dict().keys()
+    for name, value in agent.state_dict().items():
+        torch.testing.assert_close(value, saved[name], rtol=0, atol=0)
