@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import os
 import signal
 import sys
 from collections import Counter
@@ -19,7 +18,7 @@ from rich.table import Table
 
 from harness.estimate import Cost, EstimateError, measure
 from harness.launchers.groups import make_groups
-from harness.launchers.local import Outcome, run_local
+from harness.launchers.local import Outcome, cores, run_local
 from harness.progress import Progress, duration
 from harness.report.page import write_report
 from harness.report.results import Results, load_results
@@ -225,12 +224,6 @@ def show_costs(costs: list[Cost], jobs: int) -> None:
         f"{hours:,.1f} hours of one process, {duration(3600 * hours / jobs)} with {jobs} at a "
         f"time, {sum(c.bytes for c in costs) / 1e9:.2f} GB. Evaluations come on top."
     )
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 def main() -> None:

@@ -51,6 +51,12 @@ class _Child:
         return False
 
 
+def cores() -> int:
+    """Cores that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
 def run_local(groups: list[Group], store: Store, jobs: int, progress: Progress) -> Outcome:
     """Run the groups, `jobs` at a time; whatever ends this early stops the children first.
 
@@ -61,7 +67,7 @@ def run_local(groups: list[Group], store: Store, jobs: int, progress: Progress) 
         while waiting or children:
             while waiting and len(children) < jobs:
                 group = waiting.popleft()
-                child = _start(group, store, max(1, (os.cpu_count() or 1) // jobs))
+                child = _start(group, store, max(1, cores() // jobs))
                 if child is not None:
                     children.append(child)
                     continue
