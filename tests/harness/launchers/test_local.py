@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from rich.console import Console
 
-from harness.launchers.local import ROOT, commands, run_local
+from harness.launchers import local
+from harness.launchers.local import ROOT, commands, cores, run_local
 from harness.progress import Progress
 from harness.store import Store
 from harness.suite import load_suite
@@ -127,3 +132,131 @@ def test_runs_whose_launcher_was_killed_are_not_started_twice(suite_file, tmp_pa
     assert [path.read_text().count("\n") for path in results.glob("tiny/*/metrics.csv")] == [
         201
     ] * 2
+
+
+# --- two commands: train, then evaluate -----------------------------------------------------------
+
+
+@pytest.fixture
+def evaluated(suite):
+    """A run that is evaluated when it is trained."""
+    return dataclasses.replace(suite.runs[0], evaluation={"levels": 3, "repeats": 2})
+
+
+def say(name: str, more: str = "") -> str:
+    """Code of a command that writes the files of a run that have to be there, and its name."""
+    files = ("metrics.csv", "checkpoint.pt") if name == "train" else ("evaluation.csv",)
+    code = f"import os, pathlib, sys, time; folder = pathlib.Path(sys.argv[1]); print({name!r})\n"
+    return code + more + "".join(f"\n(folder / {file!r}).write_text({name!r})" for file in files)
+
+
+@pytest.fixture
+def scripts(monkeypatch):
+    """Commands in place of a baseline and its evaluation, which are given the run's folder."""
+
+    def use(*codes: str) -> None:
+        def made(spec, store):
+            path = store.path(spec).resolve()
+            return [[sys.executable, "-c", code, str(path)] for code in codes]
+
+        monkeypatch.setattr(local, "commands", made)
+
+    return use
+
+
+def test_the_commands_of_a_run_that_is_evaluated(store, evaluated, suite):
+    path = str(store.path(evaluated).resolve())
+    train, judge = commands(evaluated, store)
+    assert train == commands(suite.runs[0], store)[0]
+    assert train[1:3] == ["-m", "baselines.ppo_reg"]
+    assert train[-3:] == ["--run-dir", path, "--resume"]
+    flags = ["--levels", "3", "--repeats", "2"]
+    assert judge == [sys.executable, "-m", "harness", "evaluate", path, *flags]
+    assert len(commands(suite.runs[0], store)) == 1
+
+
+def test_the_second_command_follows_the_first(store, evaluated, scripts):
+    late = "assert (folder / 'metrics.csv').read_text() == 'train'"
+    scripts(say("train", "time.sleep(0.5)"), say("judge", late))
+    assert run([evaluated], store).done == [evaluated]
+    assert store.path(evaluated, "log.txt").read_text().split() == ["train", "judge"]
+    done = json.loads(store.path(evaluated, "done.json").read_text())
+    assert done["sha256"]["evaluation.csv"] == hashlib.sha256(b"judge").hexdigest()
+    assert done["seconds"] >= 0.5
+
+
+def test_nothing_follows_a_command_that_fails(store, evaluated, scripts):
+    scripts(say("train", "sys.exit(3)"), say("judge"))
+    assert run([evaluated], store).failed == [evaluated]
+    assert store.path(evaluated, "log.txt").read_text().split() == ["train"]
+    failed = json.loads(store.path(evaluated, "failed.json").read_text())
+    assert failed == {"returncode": 3}
+
+
+def test_a_run_whose_second_command_fails_has_failed(store, evaluated, suite, scripts):
+    scripts(say("train"), say("judge", "sys.exit(4)"))
+    outcome = run([evaluated, suite.runs[1]], store)
+    assert evaluated in outcome.failed
+    assert store.state(evaluated) == "failed"
+    assert json.loads(store.path(evaluated, "failed.json").read_text()) == {"returncode": 4}
+    assert not store.path(evaluated, "done.json").exists()
+
+
+@pytest.mark.parametrize("when", ["train", "judge"])
+def test_a_run_that_is_stopped_goes_on_when_it_is_run_again(store, evaluated, scripts, when):
+    pause = {when: "(folder / 'begun').touch(); time.sleep(60)"}
+    scripts(*(say(name, pause.get(name, "")) for name in ("train", "judge")))
+
+    class Stopping(Progress):
+        def update(self, running):
+            if store.path(evaluated, "begun").exists():
+                raise KeyboardInterrupt
+
+    progress = Stopping(Console(file=io.StringIO()), store, [evaluated])
+    with pytest.raises(KeyboardInterrupt):
+        run_local([evaluated], store, 1, progress)
+    assert store.state(evaluated) == "interrupted"
+    assert not store.path(evaluated, "evaluation.csv").exists()
+    assert store.path(evaluated, "metrics.csv").exists() == (when == "judge")
+    scripts(say("train"), say("judge"))
+    assert run([evaluated], store).done == [evaluated]
+    assert store.state(evaluated) == "done"
+
+
+@pytest.mark.parametrize(("jobs", "share"), [(1, 4), (2, 2), (3, 1), (9, 1)])
+def test_a_run_has_its_share_of_the_cores(store, evaluated, scripts, monkeypatch, jobs, share):
+    monkeypatch.setattr(local, "cores", lambda: 4)
+    show = "print(os.environ['OMP_NUM_THREADS'])"
+    scripts(say("train", show), say("judge", show))
+    run([evaluated], store, jobs)
+    log = store.path(evaluated, "log.txt").read_text()
+    assert log.split() == ["train", str(share), "judge", str(share)]
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system pins no processes")
+def test_cores_are_those_that_the_process_may_use():
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(allowed)})
+    try:
+        assert cores() == 1
+    finally:
+        os.sched_setaffinity(0, allowed)
+    assert cores() == len(allowed)
+
+
+def test_a_trained_agent_that_was_not_evaluated_yet_only_is(store, coinrun_run):
+    """As after an interruption between the two: training says that it is finished."""
+    folder, spec = coinrun_run
+    shutil.copytree(folder, store.path(spec))
+    before = store.path(spec, "checkpoint.pt").read_bytes()
+    assert run([spec], store, jobs=99).done == [spec]  # on one core
+    log = store.path(spec, "log.txt").read_text()
+    assert "is finished" in log
+    assert log.index("is finished") < log.index("sampled")
+    assert store.path(spec, "checkpoint.pt").read_bytes() == before
+    episodes = pd.read_csv(store.path(spec, "evaluation.csv"))
+    assert episodes.groupby(["split", "policy"]).size().tolist() == [1, 1, 1, 1]
+    content = store.path(spec, "evaluation.csv").read_bytes()
+    done = json.loads(store.path(spec, "done.json").read_text())
+    assert done["sha256"]["evaluation.csv"] == hashlib.sha256(content).hexdigest()
+    assert store.path(spec, "seen.gif").exists()
