@@ -79,7 +79,7 @@ def write_run(
         episodes: What it did on levels, if it was evaluated: see `make_episodes`.
         done: Whether it came to its end.
     """
-    store.start(spec, ["true"])
+    store.start(spec, ["true"], [spec])
     steps = np.arange(1, len(returns) + 1) * 100
     metrics = pd.DataFrame(
         {

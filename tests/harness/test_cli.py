@@ -59,7 +59,7 @@ def test_run_all_runs_reports_and_runs_nothing_twice(run_cli, store, small):
 
 def test_run_all_ends_with_the_log_of_what_failed(run_cli, store, suite, small):
     broken = suite.runs[0]
-    store.start(broken, ["true"])
+    store.start(broken, ["true"], [broken])
     store.path(broken, "checkpoint.pt").write_bytes(b"torn")
     status, out = run_cli("run-all", *small)
     assert status == 1
@@ -83,7 +83,7 @@ def test_a_changed_configuration_is_refused_before_anything_starts(run_cli, stor
 
 def test_status_counts_states(run_cli, store, suite, suite_file):
     write_run(store, suite.runs[0], [1.0, 2.0])
-    store.start(suite.runs[1], ["true"])
+    store.start(suite.runs[1], ["true"], [suite.runs[1]])
     status, out = run_cli("status", "--suite", suite_file, "--results-dir", store.root)
     row = next(line for line in out.splitlines() if "tiny" in line)
     assert status == 0

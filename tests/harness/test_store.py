@@ -16,7 +16,7 @@ from tests.harness.conftest import make_episodes, write_run
 def test_a_run_goes_from_pending_to_done(store, suite):
     spec = suite.runs[0]
     assert store.state(spec) == "pending"
-    store.start(spec, ["true"])
+    store.start(spec, ["true"], [spec])
     assert store.state(spec) == "interrupted"
     write_run(store, spec, [1.0])
     assert store.state(spec) == "done"
@@ -24,16 +24,16 @@ def test_a_run_goes_from_pending_to_done(store, suite):
 
 def test_a_failed_run_says_so_until_it_is_started_again(store, suite):
     spec = suite.runs[0]
-    store.start(spec, ["false"])
+    store.start(spec, ["false"], [spec])
     store.finish(spec, returncode=1, seconds=1.0)
     assert store.state(spec) == "failed"
-    store.start(spec, ["true"])
+    store.start(spec, ["true"], [spec])
     assert store.state(spec) == "interrupted"
 
 
 def test_a_locked_run_is_running(store, suite):
     spec = suite.runs[0]
-    store.start(spec, ["true"])
+    store.start(spec, ["true"], [spec])
     with store.lock(spec) as lock:
         assert lock is not None
         assert store.state(spec) == "running"
@@ -45,7 +45,7 @@ def test_a_locked_run_is_running(store, suite):
 def test_asking_for_the_state_does_not_make_another_give_a_run_up(store, suite):
     """The question takes the lock for an instant, and whoever wants the run waits for longer."""
     spec = suite.runs[0]
-    store.start(spec, ["true"])
+    store.start(spec, ["true"], [spec])
     stop = threading.Event()
 
     def ask() -> None:
@@ -132,7 +132,7 @@ def test_a_run_without_rows_has_no_metrics(store, suite):
     spec = suite.runs[0]
     assert store.metrics(spec) is None
     assert store.steps(spec) == 0
-    store.start(spec, ["true"])
+    store.start(spec, ["true"], [spec])
     store.path(spec, "metrics.csv").write_text("global_step,charts/SPS\n")
     assert store.metrics(spec) is None
     assert store.steps(spec) == 0
@@ -157,6 +157,6 @@ def test_json_is_written_whole_or_not_at_all(tmp_path):
 def test_the_end_of_the_log(store, suite):
     spec = suite.runs[0]
     assert store.log_tail(spec) == "(no log)"
-    store.start(spec, ["true"])
+    store.start(spec, ["true"], [spec])
     store.path(spec, "log.txt").write_text("\n".join(map(str, range(30))))
     assert store.log_tail(spec, lines=2) == "28\n29"

@@ -19,7 +19,8 @@ import pytest
 from rich.console import Console
 
 from harness.launchers import local
-from harness.launchers.local import ROOT, commands, cores, run_local
+from harness.launchers.groups import commands
+from harness.launchers.local import ROOT, cores, run_local
 from harness.progress import Progress
 from harness.store import Store
 from harness.suite import load_suite
@@ -27,8 +28,9 @@ from tests.harness.conftest import write_run
 
 
 def run(specs, store, jobs=2):
+    """Each in a process of its own."""
     with Progress(Console(file=io.StringIO()), store, specs) as progress:
-        return run_local(specs, store, jobs, progress)
+        return run_local([[spec] for spec in specs], store, jobs, progress)
 
 
 def start_run_all(suite_file: Path, results: Path) -> subprocess.Popen:
@@ -69,12 +71,12 @@ def test_runs_finish_and_leave_what_the_store_promises(store, suite):
         assert store.steps(spec) == 200
         assert "update 2/2" in store.path(spec, "log.txt").read_text()
         written = json.loads(store.path(spec, "spec.json").read_text())
-        assert [written["command"]] == commands(spec, store)
+        assert [written["command"]] == commands([spec], store)
 
 
 def test_a_failed_run_is_told_from_the_others(store, suite):
     broken, good = suite.runs[:2]
-    store.start(broken, ["true"])
+    store.start(broken, ["true"], [broken])
     store.path(broken, "checkpoint.pt").write_bytes(b"torn")
     outcome = run([broken, good], store)
     assert (outcome.failed, outcome.done) == ([broken], [good])
@@ -155,8 +157,8 @@ def scripts(monkeypatch):
     """Commands in place of a baseline and its evaluation, which are given the run's folder."""
 
     def use(*codes: str) -> None:
-        def made(spec, store):
-            path = store.path(spec).resolve()
+        def made(group, store):
+            path = store.path(group[0]).resolve()
             return [[sys.executable, "-c", code, str(path)] for code in codes]
 
         monkeypatch.setattr(local, "commands", made)
@@ -166,13 +168,13 @@ def scripts(monkeypatch):
 
 def test_the_commands_of_a_run_that_is_evaluated(store, evaluated, suite):
     path = str(store.path(evaluated).resolve())
-    train, judge = commands(evaluated, store)
-    assert train == commands(suite.runs[0], store)[0]
+    train, judge = commands([evaluated], store)
+    assert train == commands([suite.runs[0]], store)[0]
     assert train[1:3] == ["-m", "baselines.ppo_reg"]
     assert train[-3:] == ["--run-dir", path, "--resume"]
     flags = ["--levels", "3", "--repeats", "2"]
     assert judge == [sys.executable, "-m", "harness", "evaluate", path, *flags]
-    assert len(commands(suite.runs[0], store)) == 1
+    assert len(commands([suite.runs[0]], store)) == 1
 
 
 def test_the_second_command_follows_the_first(store, evaluated, scripts):
@@ -214,7 +216,7 @@ def test_a_run_that_is_stopped_goes_on_when_it_is_run_again(store, evaluated, sc
 
     progress = Stopping(Console(file=io.StringIO()), store, [evaluated])
     with pytest.raises(KeyboardInterrupt):
-        run_local([evaluated], store, 1, progress)
+        run_local([[evaluated]], store, 1, progress)
     assert store.state(evaluated) == "interrupted"
     assert not store.path(evaluated, "evaluation.csv").exists()
     assert store.path(evaluated, "metrics.csv").exists() == (when == "judge")
