@@ -191,7 +191,7 @@ def make_claims(results: Results) -> list[Claim]:
     compared = (comparison_claim(agents, letter, planned) for letter in "bc")
     claims = [conditioning_claim(agents), *compared]
     if (agents["updates"] < MIN_UPDATES).any():
-        claims = [_without_verdict(claim) for claim in claims]
+        claims = [without_verdict(claim) for claim in claims]
     return [claim for claim in claims if claim.findings]
 
 
@@ -206,7 +206,7 @@ def to_frame(claims: list[Claim]) -> pd.DataFrame:
     )  # fmt: skip
 
 
-def _without_verdict(claim: Claim) -> Claim:
+def without_verdict(claim: Claim) -> Claim:
     findings = [dataclasses.replace(f, verdict=TOO_FEW) for f in claim.findings]
     return dataclasses.replace(claim, verdict=TOO_FEW, findings=findings)
 

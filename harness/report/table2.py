@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from rich.table import Table
 
-from harness.report.claims import Claim, Finding, agreed
+from harness.report.claims import MIN_UPDATES, Claim, Finding, agreed, without_verdict
 from harness.report.figures import COLORS, draw_curves, save, tidy
 from harness.report.markdown import to_markdown_table
 from harness.report.paper import paper_numbers
@@ -169,7 +169,9 @@ def generalization_claim(results: Results) -> Claim:
             estimate = estimate_mean(np.array(gains))
             about = f"{plain} reg - {plain}: success, {split} levels"
             findings.append(Finding(about, environment, estimate, verdict(estimate, +1)))
-    return Claim("d", STATEMENT, agreed([f.verdict for f in findings]), findings)
+    claim = Claim("d", STATEMENT, agreed([f.verdict for f in findings]), findings)
+    short = any(len(results.metrics[run_id]) < MIN_UPDATES for run_id in results.evaluations)
+    return without_verdict(claim) if short else claim
 
 
 def _plain(results: Results) -> list[str]:
