@@ -20,6 +20,7 @@ from harness.report.results import Results
 from harness.statistics import Estimate, estimate_mean, estimate_success, success_matrix, verdict
 
 SPLITS, POLICIES = ("seen", "unseen"), ("sampled", "greedy")
+PAPERS = "CoinRun"  # the game that the paper has
 STATEMENT = "The regularizer improves all four CoinRun agents, on seen and on unseen levels."
 DEVIATIONS = (
     "The engine is Procgen's CoinRun (EnvPool's port), hard levels, where the paper has the "
@@ -74,7 +75,8 @@ def make_cells(results: Results) -> list[Cell]:
                     levels=matrices[0].shape[0] if matrices else 0,
                     repeats=matrices[0].shape[1] if matrices else 0,
                     planned=suite.planned[environment, algorithm], steps=steps,
-                    paper=paper[split].get(algorithm) if policy == "sampled" else None,
+                    paper=paper[split].get(algorithm)
+                    if (policy, environment) == ("sampled", PAPERS) else None,
                 )
             )  # fmt: skip
     return cells
@@ -112,16 +114,17 @@ def notes(results: Results, cells: list[Cell]) -> list[str]:
 
 
 def to_rows(results: Results, cells: list[Cell]) -> tuple[list[str], list[list[str]]]:
-    """The table as text: a header, and a row for each kind of levels and of actions."""
+    """The table as text: a header, and a row for each game, kind of levels and of actions."""
     algorithms = [a for a in results.suite.algorithms if any(c.algorithm == a for c in cells)]
     header = ["levels", *(x for a in algorithms for x in (a, f"{a}, paper"))]
-    found = {(c.policy, c.split, c.algorithm): c for c in cells}
-    rows = []
-    for policy, split in itertools.product(POLICIES, SPLITS):
-        row = [f"{split}, {policy}"]
+    found = {(c.environment, c.policy, c.split, c.algorithm): c for c in cells}
+    games, rows = results.suite.environments, []
+    for game, policy, split in itertools.product(games, POLICIES, SPLITS):
+        row = [f"{split}, {policy}" if len(games) == 1 else f"{game}: {split}, {policy}"]
         for algorithm in algorithms:
-            cell = found[policy, split, algorithm]
-            row += [cell.text, "" if cell.paper is None else f"{cell.paper:.1f}"]
+            cell = found.get((game, policy, split, algorithm))
+            paper = cell.paper if cell else None
+            row += [cell.text if cell else "", "" if paper is None else f"{paper:.1f}"]
         rows.append(row)
     return header, rows
 
@@ -185,24 +188,25 @@ def _rates(episodes: pd.DataFrame) -> dict[str, float]:
 
 def success_curves(results: Results, path: Path) -> None:
     """Figure 4: success on seen and unseen levels, and psi, a column for each pair of agents."""
-    pairs = _plain(results)
+    games = results.suite.environments
+    pairs = list(itertools.product(games, _plain(results)))
     measures = (("eval/success_seen", "success, seen"), ("eval/success_unseen", "success, unseen"))
     measures += (("conditioning/psi", "psi"),)
     figure, axes = plt.subplots(
         3, len(pairs), figsize=(3.4 * len(pairs), 6.5), squeeze=False, sharex=True, sharey="row",
         layout="constrained",
     )  # fmt: skip
-    environment = results.suite.environments[0]
-    for column, plain in enumerate(pairs):
+    for column, (game, plain) in enumerate(pairs):
         for row, (measure, label) in enumerate(measures):
             axis: Any = axes[row, column]
             tidy(axis)
             for name, color, kind in zip((plain, f"{plain} reg"), COLORS, ("plain", "reg"),
                                          strict=False):  # fmt: skip
-                draw_curves(axis, _by_update(results, environment, name, measure), kind, color)
+                draw_curves(axis, _by_update(results, game, name, measure), kind, color)
             if measure.startswith("eval"):
                 axis.set_ylim(-0.03, 1.03)
-            axis.set_title(plain if row == 0 else "", fontsize=11)
+            title = plain if len(games) == 1 else f"{game}: {plain}"
+            axis.set_title(title if row == 0 else "", fontsize=11)
             axis.set_ylabel(label if column == 0 else "")
         axes[-1, column].set_xlabel("environment steps")
     save(figure, path)
