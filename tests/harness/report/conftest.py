@@ -8,6 +8,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
@@ -83,3 +84,38 @@ def drawn(monkeypatch) -> Iterator[Callable[[], Figure]]:
         patch.setattr(plt, "close", lambda figure: None)
         yield plt.gcf
     plt.close("all")
+
+
+def make_games(
+    folder: Path,
+    episodes: Callable[[str, str, int], pd.DataFrame],
+    algorithms: Sequence[str],
+    games: dict[str, str],
+    *,
+    updates: int = 3,
+    seeds: Sequence[int] = (1,),
+    gifs: bool = False,
+    own: str = "",
+) -> Results:
+    """Results of agents that were evaluated on levels: `make_study` for games.
+
+    `episodes` is called with game, algorithm and seed. A name that ends in " reg" is regularized.
+    """
+    text = f'title = "Games"\nseeds = {list(seeds)}\nagents = 1\n{own}\n'
+    text += "[args]\ntotal_timesteps = 8192\n[evaluation]\nlevels = 2\nrepeats = 2\n"
+    for name in algorithms:
+        rate = 1e-3 if name.endswith(" reg") else 0.0
+        text += f'[[algorithms]]\nname = "{name}"\nbaseline = "ppo_reg_coinrun"\n'
+        text += f"args = {{ coefficient = {rate} }}\n"
+    text += "[environments]\n" + "".join(f'"{k}" = "{v}"\n' for k, v in games.items())
+    path, store = folder / "games.toml", Store(folder / "results")
+    path.write_text(text)
+    suite = load_suite(str(path))
+    rates = np.linspace(0.1, 0.3, updates)
+    columns = {"eval/success_seen": rates, "eval/success_unseen": rates / 2}
+    for run in suite.runs:
+        found = episodes(run.environment, run.algorithm, run.args["seed"])
+        write_run(store, run, np.zeros(updates), columns=columns, episodes=found)
+        for split in ("seen", "unseen") if gifs else ():
+            store.path(run, f"{split}.gif").write_bytes(b"GIF89a")
+    return load_results(suite, store)

@@ -1,0 +1,320 @@
+"""Table 2, Figure 4 and claim (d), from episodes with known rates."""
+
+from __future__ import annotations
+
+import itertools
+
+import matplotlib.image
+import numpy as np
+import pandas as pd
+import pytest
+from rich.console import Console
+
+from harness.report.claims import MIN_UPDATES
+from harness.report.results import load_results
+from harness.report.table2 import (
+    DEVIATIONS,
+    generalization_claim,
+    make_cells,
+    notes,
+    success_curves,
+    to_frame,
+    to_markdown,
+    to_rich,
+    to_rows,
+)
+from harness.suite import load_suite
+from tests.harness.conftest import make_episodes, write_run
+from tests.harness.report.conftest import make_games
+
+SEEN, UNSEEN = [[1, 1], [1, 0]], [[0, 1], [0, 0]]  # rates 3/4 and 1/4
+HALF = [[1], [0]]
+
+
+def episodes(seen=SEEN, unseen=UNSEEN, seen_greedy=HALF, unseen_greedy=HALF) -> pd.DataFrame:
+    return make_episodes(
+        seen_sampled=seen, unseen_sampled=unseen, seen_greedy=seen_greedy,
+        unseen_greedy=unseen_greedy,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def results(store):
+    """Of the eight agents PPO is always right, PPO reg has three of four, PPO-l2 still learns."""
+    suite = load_suite("table2")
+    runs = {run.algorithm: run for run in suite.runs}
+    sure = [[1, 1], [1, 1]]
+    write_run(store, runs["PPO"], [1.0] * 3, episodes=episodes(sure, sure))
+    write_run(store, runs["PPO reg"], [1.0] * 4, episodes=episodes())
+    write_run(store, runs["PPO-l2"], [1.0] * 9, episodes=episodes(), done=False)
+    return load_results(suite, store)
+
+
+@pytest.fixture
+def cells(results):
+    return {(c.algorithm, c.split, c.policy): c for c in make_cells(results)}
+
+
+def test_every_agent_has_a_cell_for_each_kind_of_levels_and_actions(results, cells):
+    kinds = itertools.product(results.suite.algorithms, ("seen", "unseen"), ("sampled", "greedy"))
+    assert set(cells) == set(kinds)
+
+
+def test_a_cell_is_the_success_rate_over_levels(cells):
+    cell = cells["PPO reg", "seen", "sampled"]
+    assert cell.estimate.mean == 0.75
+    assert cells["PPO reg", "unseen", "sampled"].estimate.mean == 0.25
+    assert cells["PPO reg", "unseen", "greedy"].estimate.mean == 0.5
+    assert (cell.estimate.n, cell.planned, cell.levels, cell.repeats) == (1, 1, 2, 2)
+    assert cells["PPO reg", "seen", "greedy"].repeats == 1
+    assert (cell.steps, cells["PPO", "seen", "sampled"].steps) == (400, 300)
+
+
+def test_a_cell_says_percent_with_its_interval(cells):
+    assert cells["PPO", "seen", "sampled"].text == "100.0 [100.0, 100.0]"
+    # two levels, won and lost: resampling them gives 0 and 1 a quarter of the time each
+    assert cells["PPO", "seen", "greedy"].text == "50.0 [0.0, 100.0]"
+    assert cells["PPO reg", "seen", "sampled"].text.startswith("75.0 [")
+
+
+def test_an_agent_that_is_not_done_has_no_cell_yet(cells):
+    assert cells["PPO-l2", "seen", "sampled"].text == "–"
+    assert cells["PPO-l2", "seen", "sampled"].levels == 0
+    assert cells["PPO-l2", "seen", "sampled"].steps == 900
+
+
+def test_the_papers_numbers_stand_beside_the_sampled_actions(results, cells):
+    algorithms = results.suite.algorithms
+    seen = [cells[a, "seen", "sampled"].paper for a in algorithms]
+    unseen = [cells[a, "unseen", "sampled"].paper for a in algorithms]
+    assert seen == [55, 60.7, 57.2, 61, 54.5, 60.2, 59, 68.2]
+    assert unseen == [14, 20, 18.5, 30.5, 19.2, 20, 26, 32.8]
+    assert {c.paper for c in cells.values() if c.policy == "greedy"} == {None}
+
+
+def test_the_notes_say_what_the_cells_rest_on(results, cells):
+    said = notes(results, list(cells.values()))
+    assert said[0].startswith("2 seen and 2 unseen levels, 2 repeats")
+    assert said[0].endswith("The paper: 500 training levels, 20 repeats.")
+    assert "at most 1; the paper has 1" in said[1]
+    assert "Steps done: 300; the paper's runs have 50,000,000." in said[2]
+    others = "PPO-D, PPO-D reg, PPO-IMP, PPO-IMP reg, PPO-l2, PPO-l2 reg"
+    assert said[3] == f"Not all evaluated yet: {others}."
+    assert said[4:] == list(DEVIATIONS)
+
+
+def test_full_runs_that_are_all_there_are_not_called_short_or_missing(store):
+    suite = load_suite("table2")
+    for run in suite.runs:
+        write_run(store, run, [1.0], columns={"global_step": [49_000_000]}, episodes=episodes())
+    results = load_results(suite, store)
+    said = notes(results, make_cells(results))
+    assert len(said) == 2 + len(DEVIATIONS)
+
+
+def test_without_runs_there_are_the_papers_numbers_and_the_deviations(store):
+    results = load_results(load_suite("table2"), store)
+    cells = make_cells(results)
+    said = notes(results, cells)
+    assert said[0].startswith("Not all evaluated yet: PPO, ")
+    assert said[1:] == list(DEVIATIONS)
+    _, rows = to_rows(results, cells)
+    assert rows[0][1:3] == ["–", "55.0"]
+
+
+def test_each_deviation_that_a_reader_would_ask_for_is_named():
+    said = " ".join(DEVIATIONS).lower()
+    for word in ("engine", "15 actions", "velocity", "visual themes", "unseen levels", "dropout"):
+        assert word in said
+
+
+def test_rows_are_kinds_of_levels_and_columns_agents_beside_the_paper(results, cells):
+    header, rows = to_rows(results, list(cells.values()))
+    assert header[:5] == ["levels", "PPO", "PPO, paper", "PPO reg", "PPO reg, paper"]
+    assert [row[0] for row in rows] == [
+        "seen, sampled", "unseen, sampled", "seen, greedy", "unseen, greedy",
+    ]  # fmt: skip
+    assert [len(row) for row in rows] == [17] * 4
+    assert rows[1][1:3] == ["100.0 [100.0, 100.0]", "14.0"]
+    assert rows[2][1:3] == ["50.0 [0.0, 100.0]", ""]
+    assert rows[0][5:7] == ["–", "57.2"]
+
+
+def test_markdown_has_the_table_and_the_notes(results, cells):
+    lines = to_markdown(results, list(cells.values())).splitlines()
+    assert lines[0] == f"# {results.suite.title}"
+    row = next(line for line in lines if line.startswith("| unseen, sampled"))
+    assert row.startswith("| unseen, sampled | 100.0 [100.0, 100.0] | 14.0 | 25.0 [")
+    assert [line for line in lines if line.startswith("- ")][-1] == f"- {DEVIATIONS[-1]}"
+
+
+def test_the_frame_has_a_row_for_each_cell(cells):
+    frame = to_frame(list(cells.values()))
+    assert len(frame) == 8 * 4
+    columns = {"algorithm", "split", "policy", "mean", "low", "high", "n", "paper", "steps"}
+    assert columns <= set(frame.columns)
+    assert frame["mean"].dropna().tolist() == [1.0, 1.0, 0.5, 0.5, 0.75, 0.25, 0.5, 0.5]
+
+
+def test_the_terminal_shows_an_agent_to_a_line(results, cells):
+    console = Console(record=True, width=140)
+    console.print(to_rich(results, list(cells.values())))
+    text = console.export_text()
+    line = next(line for line in text.splitlines() if "PPO reg" in line)
+    assert "75.0 [" in line
+    assert "100.0 [100.0, 100.0]" in text
+    assert "paper 32.8" in text
+
+
+def games_of(folder, algorithms, games):
+    return make_games(folder, lambda game, *_: episodes([[game == "Maze"] * 2]), algorithms, games)
+
+
+def test_each_game_has_its_rows_and_only_coinrun_the_papers_numbers(tmp_path):
+    results = games_of(tmp_path, ["PPO", "PPO reg"], {"CoinRun": "coinrun", "Maze": "maze"})
+    _, rows = to_rows(results, make_cells(results))
+    assert [row[:3] for row in rows[::4]] == [
+        ["CoinRun: seen, sampled", "0.0 [0.0, 0.0]", "55.0"],
+        ["Maze: seen, sampled", "100.0 [100.0, 100.0]", ""],
+    ]
+
+
+# --- claim (d) ------------------------------------------------------------------------------------
+
+PLAIN = [[1, 0], [0, 0]]  # 1/4
+BETTER, WORSE = [[1, 1], [0, 0]], [[0, 0], [0, 0]]  # 1/2, 0
+
+
+def claim_of(store, reg, seeds=10, updates=MIN_UPDATES, plain=PLAIN, leave_out=()):
+    """Every agent with `plain` on all levels, and with (seen, unseen) of `reg` regularized."""
+    suite = load_suite("table2", seeds=seeds)
+    for run in suite.runs:
+        if (run.algorithm, run.args["seed"]) in leave_out:
+            continue
+        found = reg if run.algorithm.endswith(" reg") else (plain, plain)
+        write_run(store, run, np.zeros(updates), episodes=episodes(*found))
+    return generalization_claim(load_results(suite, store))
+
+
+@pytest.mark.parametrize(
+    ("reg", "expected", "gains"),
+    [
+        ((BETTER, BETTER), "supported", (0.25, 0.25)),
+        ((WORSE, WORSE), "contradicted", (-0.25, -0.25)),
+        ((PLAIN, PLAIN), "not supported", (0.0, 0.0)),
+        ((BETTER, PLAIN), "not supported", (0.25, 0.0)),
+        ((BETTER, WORSE), "not supported", (0.25, -0.25)),
+    ],
+)
+def test_the_verdict_is_where_all_gains_are(store, reg, expected, gains):
+    claim = claim_of(store, reg)
+    assert (claim.letter, claim.verdict) == ("d", expected)
+    assert len(claim.findings) == 4 * 2  # pairs of agents, seen and unseen
+    assert [f.estimate.mean for f in claim.findings] == pytest.approx([*gains] * 4)
+    assert {f.estimate.n for f in claim.findings} == {10}
+    assert claim.findings[1].about == "PPO reg - PPO: success, unseen levels"
+
+
+def test_a_pair_that_fails_leaves_the_rest_without_support(store):
+    suite = load_suite("table2", seeds=10)
+    for run in suite.runs:
+        found = BETTER if run.algorithm.endswith(" reg") and "IMP" not in run.algorithm else PLAIN
+        write_run(store, run, np.zeros(MIN_UPDATES), episodes=episodes(found, found))
+    claim = generalization_claim(load_results(suite, store))
+    assert claim.verdict == "not supported"
+    verdicts = [f.verdict for f in claim.findings]
+    assert verdicts == ["supported"] * 6 + ["not supported"] * 2
+
+
+@pytest.mark.parametrize(
+    "few",
+    [
+        {"seeds": 1},
+        {"seeds": 9},
+        {"updates": MIN_UPDATES - 1},
+        {"leave_out": [("PPO-D reg", 3)]},
+        {"leave_out": [("PPO-D", s) for s in range(1, 11)]},
+    ],
+)
+def test_few_or_short_runs_have_no_verdict(store, few):
+    claim = claim_of(store, (BETTER, BETTER), **few)
+    assert claim.verdict == "too few runs to tell"
+
+
+def test_only_seeds_that_both_have_are_compared(store):
+    """Seed 3 has no regularized agent, seed 4 no plain one."""
+    suite = load_suite("table2", seeds=4)
+    rates = {1: PLAIN, 2: PLAIN, 3: BETTER, 4: WORSE}
+    for run in suite.runs:
+        seed, reg = run.args["seed"], run.algorithm.endswith(" reg")
+        if seed != (3 if reg else 4):
+            found = BETTER if reg else rates[seed]
+            write_run(store, run, [0.0], episodes=episodes(found, found))
+    claim = generalization_claim(load_results(suite, store))
+    assert {(f.estimate.mean, f.estimate.n) for f in claim.findings} == {(0.25, 2)}
+
+
+def test_greedy_episodes_do_not_move_the_claim(store):
+    suite = load_suite("table2")
+    for run in suite.runs:
+        greedy = [[run.algorithm.endswith(" reg")]] * 2
+        found = episodes(PLAIN, PLAIN, greedy, greedy)
+        write_run(store, run, [0.0], episodes=found)
+    claim = generalization_claim(load_results(suite, store))
+    assert {f.estimate.mean for f in claim.findings} == {0.0}
+
+
+# --- Figure 4 -------------------------------------------------------------------------------------
+
+
+def write_curves(store, suite, algorithm, seed, steps, seen):
+    run = next(r for r in suite.runs if (r.algorithm, r.args["seed"]) == (algorithm, seed))
+    columns = {"global_step": steps, "eval/success_seen": seen}
+    columns["eval/success_unseen"] = np.array(seen) / 2
+    write_run(store, run, [0.0] * len(steps), psi=0.9, columns=columns, done=False)
+
+
+def test_curves_of_seeds_that_count_their_steps_differently_are_one(store, tmp_path, drawn):
+    suite = load_suite("table2", seeds=2)
+    write_curves(store, suite, "PPO", 1, [100, 198, 300], [np.nan, 0.2, 0.4])
+    write_curves(store, suite, "PPO", 2, [98, 200, 296], [np.nan, 0.4, 0.8])
+    success_curves(load_results(suite, store), tmp_path / "figure4.png")
+    axes = np.array(drawn().axes).reshape(3, 4)
+    assert [axis.get_title() for axis in axes[0]] == ["PPO", "PPO-l2", "PPO-D", "PPO-IMP"]
+    assert [axis.get_ylabel() for axis in axes[:, 0]] == [
+        "success, seen", "success, unseen", "psi",
+    ]  # fmt: skip
+    for axis, x, y in (
+        (axes[0, 0], [199, 298], [0.3, 0.6]),
+        (axes[1, 0], [199, 298], [0.15, 0.3]),
+        (axes[2, 0], [99, 199, 298], [0.9, 0.9, 0.9]),
+    ):
+        (line,) = axis.get_lines()
+        np.testing.assert_allclose(line.get_xdata(), x)
+        np.testing.assert_allclose(line.get_ydata(), y)
+        assert len(axis.collections) == 1  # the interval over the two
+    assert not axes[0, 1].get_lines()
+
+
+def test_the_legend_tells_plain_from_regularized(store, tmp_path, drawn):
+    suite = load_suite("table2")
+    for name in ("PPO", "PPO reg"):
+        write_curves(store, suite, name, 1, [100, 200], [0.1, 0.2])
+    success_curves(load_results(suite, store), tmp_path / "figure4.png")
+    assert [text.get_text() for text in drawn().legends[0].get_texts()] == ["plain", "reg"]
+    assert matplotlib.image.imread(tmp_path / "figure4.png").std() > 0.01
+
+
+def test_a_figure_is_drawn_of_runs_that_were_never_evaluated_on_the_way(store, tmp_path, drawn):
+    suite = load_suite("table2")
+    write_curves(store, suite, "PPO", 1, [100, 200], [np.nan, np.nan])
+    success_curves(load_results(suite, store), tmp_path / "figure4.png")
+    axes = np.array(drawn().axes).reshape(3, 4)
+    assert [len(axis.get_lines()) for axis in axes[:, 0]] == [0, 0, 1]
+
+
+def test_each_game_has_its_columns(tmp_path, drawn):
+    results = games_of(tmp_path, ["PPO", "PPO reg"], {"CoinRun": "coinrun", "Maze": "maze"})
+    success_curves(results, tmp_path / "figure4.png")
+    titles = [axis.get_title() for axis in drawn().axes[:2]]
+    assert titles == ["CoinRun: PPO", "Maze: PPO"]
