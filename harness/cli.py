@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 import signal
@@ -83,7 +84,9 @@ def run_all(
     if todo:
         with Progress(console, store, todo) as progress:
             outcome = run_local(make_groups(todo, store, jobs, plain), store, jobs, progress)
-    whole = load_results(load_suite(suite, total_timesteps=total_timesteps), store)
+    own = load_suite(suite, total_timesteps=total_timesteps)
+    runs = {run.run_id: run for run in [*own.runs, *plan.runs]}  # seeds beyond the suite's too
+    whole = load_results(dataclasses.replace(own, runs=list(runs.values())), store)
     make_report(whole, store)
     show_others(whole)
     if outcome.held:
@@ -165,14 +168,17 @@ def evaluate(
 
 
 @app.command(name="report")
-def report(suite: str = DEFAULT_SUITE, results_dir: Path = Path("results")) -> None:
+def report(
+    suite: str = DEFAULT_SUITE, results_dir: Path = Path("results"), seeds: int | None = None
+) -> None:
     """Report what a suite's runs show so far, beside the paper's tables.
 
     Args:
         suite: Name of a suite (see `list`), or path of a TOML file.
         results_dir: Where the runs' folders are and the report goes.
+        seeds: So many seeds, as in `run-all`: the suite's first, then those that follow its last.
     """
-    plan, store = load_suite(suite), Store(results_dir)
+    plan, store = load_suite(suite, seeds=seeds), Store(results_dir)
     make_report(load_results(plan, store), store)
 
 
