@@ -6,12 +6,14 @@ import dataclasses
 import subprocess
 import sys
 
+import pandas as pd
 import pytest
 
-from harness import cli
+from harness import cli, evaluate
 from harness.launchers.local import ROOT
 from harness.schema import suite_names
-from tests.harness.conftest import write_run
+from harness.suite import load_suite
+from tests.harness.conftest import make_episodes, write_run
 
 
 @pytest.fixture
@@ -107,6 +109,68 @@ def test_a_part_of_a_suite_does_not_hide_the_rest_of_the_report(run_cli, store, 
     _, out = run_cli("run-all", *small)
     assert "Reacher" in out
     assert (store.root / "tiny" / "report" / "table1.csv").read_text().count("\n") == 5
+
+
+def test_seeds_beyond_the_suites_own_are_in_the_report(run_cli, store, suite_file):
+    for spec in load_suite(str(suite_file), seeds=3).runs:
+        write_run(store, spec, [6.0 if spec.args["seed"] == 3 else 0.0])
+    words = ["--suite", suite_file, "--results-dir", store.root, "--seeds", 3]
+    table = store.root / "tiny" / "report" / "table1.csv"
+    for command in ("run-all", "report"):
+        status, out = run_cli(command, *words)
+        assert status == 0, out
+        cells = pd.read_csv(table)
+        assert cells["mean"].tolist() == [2.0] * 4
+        assert (set(cells["seeds"]), set(cells["planned"])) == ({3}, {6})
+        table.unlink()
+    run_cli("run-all", *words[:-1], 1)  # fewer seeds hide nothing of the suite
+    assert set(pd.read_csv(table)["seeds"]) == {2}
+
+
+def test_evaluate_says_the_rates_and_their_intervals(run_cli, monkeypatch, tmp_path):
+    episodes = make_episodes(
+        seen_sampled=[[1, 1], [1, 1]], unseen_sampled=[[0, 1], [0, 0]],
+        seen_greedy=[[1], [1]], unseen_greedy=[[0], [0]],
+    )  # fmt: skip
+    asked = []
+
+    def evaluate_run(*settings):
+        asked.append(settings[:-1])
+        return episodes
+
+    monkeypatch.setattr(evaluate, "evaluate_run", evaluate_run)
+    flags = ["--levels", 2, "--repeats", 3, "--unseen", "unbounded", "--device", "cpu"]
+    status, out = run_cli("evaluate", tmp_path, *flags)
+    assert status == 0, out
+    assert asked == [(tmp_path, 2, 3, "unbounded", "cpu")]
+    rows = [line.replace("│", " ").split() for line in out.splitlines() if "%" in line]
+    assert rows[1:] == [
+        ["seen", "greedy", "100.0%", "100.0", "to", "100.0"],
+        ["seen", "sampled", "100.0%", "100.0", "to", "100.0"],
+        ["unseen", "greedy", "0.0%", "0.0", "to", "0.0"],
+        ["unseen", "sampled", "25.0%", "0.0", "to", rows[4][5]],
+    ]
+    run_cli("evaluate", tmp_path)
+    assert asked[1] == (tmp_path, 500, 20, "next", "auto")
+
+
+def test_evaluate_refuses_in_a_line(run_cli, tmp_path):
+    status, out = run_cli("evaluate", tmp_path)
+    assert status == 1
+    assert out == f"error: {tmp_path} holds no checkpoint.pt: train it first"
+
+
+def test_status_and_list_count_the_runs_of_suites_that_include_others(run_cli, store):
+    spec = load_suite("smoke_coinrun").runs[0]
+    write_run(store, spec, [1.0], episodes=make_episodes(seen_sampled=[[1.0]]))
+    _, out = run_cli("status", "--results-dir", store.root)
+    rows = {
+        row[0]: row[1:] for row in (x.replace("│", " ").split() for x in out.splitlines()) if row
+    }
+    assert rows["smoke_coinrun"][0] == rows["smoke"][0] == "1"  # the same run, once
+    assert rows["table2"][0] == "0"
+    _, out = run_cli("list")
+    assert "1328" in next(line for line in out.splitlines() if "│ paper" in line)
 
 
 def test_list_names_every_suite(run_cli):

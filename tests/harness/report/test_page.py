@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import NamedTuple
@@ -15,8 +16,8 @@ from harness.report.page import write_report
 from harness.report.results import Results, load_results
 from harness.report.table1 import Cell, make_cells
 from harness.suite import load_suite
-from tests.harness.conftest import write_run
-from tests.harness.report.conftest import make_study
+from tests.harness.conftest import make_episodes, write_run
+from tests.harness.report.conftest import make_games, make_study
 
 VOID = {"meta", "img", "br", "hr", "link"}
 OPTIONAL = {"html"}  # end tags that HTML does not ask for
@@ -265,3 +266,145 @@ def test_a_second_report_is_the_same_to_the_byte(written, tmp_path):
     write_report(written.results, tmp_path)
     first = {path.name: path.read_bytes() for path in written.folder.iterdir()}
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == first
+
+
+# --- games: Table 2, Figure 4, claim (d) and what an agent does -----------------------------------
+
+
+def played(*_) -> pd.DataFrame:
+    half, none = [[1], [0]], [[0], [0]]
+    return make_episodes(
+        seen_sampled=half, unseen_sampled=none, seen_greedy=half, unseen_greedy=none
+    )
+
+
+@pytest.fixture
+def games(tmp_path):
+    """Makes results of agents on CoinRun, or other games."""
+
+    def make(algorithms=("PPO", "PPO reg"), names=("CoinRun",), episodes=played, **more):
+        coinrun = dict.fromkeys(names, "coinrun")
+        return make_games(tmp_path, episodes, algorithms, coinrun, **more)
+
+    return make
+
+
+def test_a_page_of_games_has_table_2_and_nothing_of_table_1(games, report):
+    folder, claims, page = report(games())
+    assert [h for h in page.headings if h.startswith("Table")] == [
+        "Table 2: success rate on CoinRun levels, %, beside the paper's"
+    ]
+    assert [claim.letter for claim in claims] == ["d"]
+    assert [image["src"] for image in page.images] == ["figure4.png", "claim_d.png"]
+    names = {path.name for path in folder.iterdir()}
+    assert names == {
+        "report.html", "table2.md", "table2.csv", "claims.csv", "figure4.png", "claim_d.png",
+    }  # fmt: skip
+    rows = {cells[0]: cells for cells in page.cells if len(cells) == 5}
+    assert rows["levels"] == ["levels", "PPO", "PPO, paper", "PPO reg", "PPO reg, paper"]
+    assert rows["seen, sampled"] == [
+        "seen, sampled", "50.0 [0.0, 100.0]", "55.0", "50.0 [0.0, 100.0]", "60.7",
+    ]  # fmt: skip
+    assert rows["unseen, greedy"][1:3] == ["0.0 [0.0, 0.0]", ""]
+    assert "The agent's velocity is painted into the frame" in page.text
+    assert len(pd.read_csv(folder / "table2.csv")) == 2 * 4
+    assert pd.read_csv(folder / "claims.csv")["claim"].tolist() == ["d", "d"]
+
+
+def test_a_page_of_control_tasks_has_nothing_of_table_2(written):
+    assert not any("Table 2" in heading for heading in written.page.headings)
+    assert not any("episodes" in heading for heading in written.page.headings)
+    assert not (written.folder / "table2.csv").exists()
+
+
+def test_a_page_of_both_has_both(games, report, store, suite):
+    """As the suites `smoke` and `paper`: runs of several files in one report."""
+    some = games()
+    write_run(store, suite.runs[0], [1.0, 2.0])
+    control = load_results(suite, store)
+    both = dataclasses.replace(
+        suite,
+        runs=[*suite.runs, *some.suite.runs],
+        environments=[*suite.environments, *some.suite.environments],
+    )
+    merged = Results(
+        both, control.metrics | some.metrics, [], control.done + some.done, some.evaluations,
+        control.folders | some.folders,
+    )  # fmt: skip
+    folder, claims, page = report(merged)
+    assert [h[:7] for h in page.headings if h.startswith("Table")] == ["Table 1", "Table 2"]
+    assert [claim.letter for claim in claims] == ["a", "d"]
+    task = next(cells for cells in page.cells if cells[0] == "Hopper")
+    assert task[1] == "1.5"
+    assert "CoinRun" not in [cells[0] for cells in page.cells]  # no row of Table 1
+    assert (folder / "table1.csv").exists()
+    assert (folder / "table2.csv").exists()
+
+
+def test_a_page_of_games_before_anything_ran(report, store):
+    _, claims, page = report(load_results(load_suite("table2"), store))
+    assert [claim.verdict for claim in claims] == ["too few runs to tell"]
+    assert [image["src"] for image in page.images] == ["claim_d.png"]
+    assert "Not all evaluated yet: PPO, " in page.text
+
+
+@pytest.mark.parametrize("algorithms", [["PPO"], ["Mine", "Other"]])
+def test_agents_without_a_regularized_partner_have_a_table_and_no_claim(games, report, algorithms):
+    _, claims, page = report(games(algorithms))
+    assert claims == []
+    assert page.images == []
+    header = next(cells for cells in page.cells if cells[0] == "levels")
+    assert header[1::2] == algorithms
+
+
+def test_the_verdict_of_claim_d_is_on_the_page(games, report):
+    seeds = range(1, 11)
+
+    def better(game, algorithm, seed):
+        won = [[1, int(algorithm.endswith("reg"))]]
+        return make_episodes(
+            seen_sampled=won, unseen_sampled=won, seen_greedy=[[1]], unseen_greedy=[[1]]
+        )
+
+    _, _, page = report(games(episodes=better, updates=MIN_UPDATES, seeds=seeds))
+    assert [text for _, text in page.verdicts] == ["supported"]
+    rows = [cells for cells in page.cells if len(cells) == 6 and cells[0] != "about"]
+    assert [(row[0], row[2], row[3], row[4]) for row in rows] == [
+        ("PPO reg - PPO: success, seen levels", "0.5", "0.5 to 0.5", "10"),
+        ("PPO reg - PPO: success, unseen levels", "0.5", "0.5 to 0.5", "10"),
+    ]
+
+
+def test_each_agents_first_recorded_episodes_are_shown(games, report):
+    results = games(seeds=(1, 2), gifs=True)
+    folder, _, page = report(results)
+    shown = [image for image in page.images if image["src"].endswith(".gif")]
+    assert [image["alt"] for image in shown] == [
+        "PPO on a seen level", "PPO on an unseen level",
+        "PPO reg on a seen level", "PPO reg on an unseen level",
+    ]  # fmt: skip
+    for image in shown:
+        assert not Path(image["src"]).is_absolute()
+        assert (folder / image["src"]).read_bytes() == b"GIF89a"
+        assert "s1__a0" in image["src"]
+
+
+def test_an_agent_with_one_episode_of_two_is_not_shown(games, report):
+    results = games(gifs=True)
+    first = results.suite.runs[0]
+    (results.folders[first.run_id] / "unseen.gif").unlink()
+    _, _, page = report(results)
+    assert {image["alt"][:7] for image in page.images if ".gif" in image["src"]} == {"PPO reg"}
+
+
+def test_names_of_games_and_their_agents_are_text_and_never_html(games, report):
+    agents = ["<script>x</script>", "<script>x</script> reg"]
+    folder, _, page = report(games(agents, ["<em>Coin"], gifs=True))
+    assert not {"script", "em"} & set(page.tags)
+    assert all(set(image) == {"src", "alt"} for image in page.images)
+    header = next(cells for cells in page.cells if cells[0] == "levels")
+    assert header[1::2] == agents
+    assert "<em>Coin" in [cells[1] for cells in page.cells if len(cells) == 6]
+    assert "<script>x</script>: seen, unseen" in page.text
+    for image in page.images:
+        assert (folder / image["src"]).exists()
