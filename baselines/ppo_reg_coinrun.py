@@ -406,7 +406,8 @@ def make_env(args: Args, num_envs: int, start_level: int) -> Procgen:
     return Procgen(
         args.env_id, num_envs, backend=args.backend, num_levels=args.num_levels,
         start_level=start_level, distribution_mode=args.distribution_mode,
-        paint_vel_info=args.paint_vel_info, num_threads=torch.get_num_threads(),
+        paint_vel_info=args.paint_vel_info,
+        num_threads=args.num_threads or torch.get_num_threads(),
     )  # fmt: skip
 
 

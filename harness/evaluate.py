@@ -33,7 +33,7 @@ class Levels(VectorEnv):
     """Several levels side by side, `repeats` environments each, in the order of `levels`."""
 
     def __init__(self, args: Args, levels: list[int], repeats: int) -> None:
-        one = dataclasses.replace(args, num_levels=1)
+        one = dataclasses.replace(args, num_levels=1, num_threads=1)  # side by side they are many
         self.envs = [make_env(one, repeats, level) for level in levels]
         self.num_envs = len(levels) * repeats
         self.metadata = self.envs[0].metadata
@@ -137,10 +137,15 @@ def evaluate_run(
         raise EvaluationError(f"{path} holds no checkpoint.pt: train it first") from None
     about = {"levels": levels, "repeats": repeats, "unseen": unseen}
     about["checkpoint_sha256"] = hashlib.sha256(content).hexdigest()
-    if read_json(path / "evaluation.json") == about:
-        return pd.read_csv(path / "evaluation.csv")
+    kept = path / "evaluation.csv"
+    if read_json(path / "evaluation.json") == about and kept.exists():
+        return pd.read_csv(kept)
     agent, args = load_agent(path / "checkpoint.pt", device)
     chosen = choose_levels(args, levels, unseen)
+    try:
+        make_env(args, 1, args.start_level).reset()
+    except RunError as error:
+        raise EvaluationError(str(error)) from None
     jobs = ((split, part) for split, some in chosen.items()
             for part in evaluate_levels(agent, args, some, repeats))  # fmt: skip
     parts = [part.assign(split=split) for split, part in show(jobs, 4 * -(-levels // POOLS))]

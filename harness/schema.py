@@ -64,8 +64,8 @@ def check_keys(given: dict[str, Any], needed: set[str], known: set[str], where: 
         raise SuiteError(f"{where} needs the key {key!r}")
 
 
-def check_args(baseline: str, args: dict[str, Any], where: str) -> None:
-    """Raise SuiteError unless the baseline takes these arguments and the environment exists."""
+def check_args(baseline: str, args: dict[str, Any], evaluation: dict[str, int], where: str) -> None:
+    """Raise SuiteError unless the baseline takes these arguments and can be so evaluated."""
     try:
         module = importlib.import_module(f"baselines.{baseline}")
         cls = module.Args
@@ -78,13 +78,17 @@ def check_args(baseline: str, args: dict[str, Any], where: str) -> None:
         if not fits(value, hints[name]):
             raise SuiteError(f"{where}: {name} must be {hints[name]}, got {value!r}")
     try:
-        cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in args.items()})
+        made = cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in args.items()})
         if not has_games:
             registers, _, name = args["env_id"].rpartition(":")
             importlib.import_module(registers or "pybullet_envs_gymnasium")
             gym.spec(name)
     except (ValueError, gym.error.Error, ModuleNotFoundError) as error:
         raise SuiteError(f"{where}: {error}") from error
+    levels = getattr(made, "num_levels", 0)
+    if evaluation and evaluation["levels"] > levels:
+        wants = f"{evaluation['levels']} levels to be evaluated on"
+        raise SuiteError(f"{where}: {wants}, but it is trained on {levels or 'no countable ones'}")
 
 
 def check_known(given: dict[str, Any], known: set[str], what: str) -> None:

@@ -192,7 +192,8 @@ def _runs(algorithm: dict[str, Any], data: dict[str, Any], path: Path) -> list[R
         args = {"env_id": env_id, **data["args"], **algorithm.get("args", {})}
         where = f"{path.name}: {algorithm['name']} on {environment}"
         for seed in data["seeds"]:
-            check_args(algorithm["baseline"], {**args, "seed": seed, "agent": 0}, where)
+            settings = {**args, "seed": seed, "agent": 0}
+            check_args(algorithm["baseline"], settings, data.get("evaluation", {}), where)
         runs += [
             RunSpec(
                 suite=path.stem,

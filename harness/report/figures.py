@@ -60,7 +60,8 @@ def learning_curves(results: Results, algorithms: list[str], path: Path) -> None
     save(figure, path)
 
 
-def draw_curves(axis: Axes, curves: pd.DataFrame, label: str, color: str) -> None:
+def draw_curves(axis: Axes, curves: pd.DataFrame, label: str, color: str, style: str = "-") -> None:
+    """The mean over agents, and its interval where there are several."""
     if curves.empty:
         return
     every = -(-len(curves) // POINTS)  # a point is the mean of so many updates
@@ -69,7 +70,8 @@ def draw_curves(axis: Axes, curves: pd.DataFrame, label: str, color: str) -> Non
     )  # fmt: skip
     mean = curves.mean(axis=1)
     marker = "o" if len(curves) <= 20 else ""
-    axis.plot(mean.index, mean, color=color, lw=1.6, label=label, marker=marker, markersize=3)
+    look = {"color": color, "lw": 1.6, "ls": style, "marker": marker, "markersize": 3}
+    axis.plot(mean.index, mean, label=label, **look)
     if curves.shape[1] > 1:
         low, high = interval_of_means(curves.to_numpy())
         axis.fill_between(mean.index, low, high, color=color, alpha=0.2, linewidth=0)

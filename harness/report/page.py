@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from pathlib import Path
+from urllib.parse import quote
 
 import jinja2
 from rich.table import Table
@@ -87,7 +88,7 @@ def _episodes(results: Results, folder: Path) -> list[tuple[str, list[str]]]:
     for run in results.suite.runs:
         gifs = [results.folders[run.run_id] / f"{split}.gif" for split in table2.SPLITS]
         if run.algorithm not in shown and all(gif.exists() for gif in gifs):
-            shown[run.algorithm] = [os.path.relpath(gif, folder) for gif in gifs]
+            shown[run.algorithm] = [quote(os.path.relpath(gif, folder)) for gif in gifs]
     return list(shown.items())
 
 

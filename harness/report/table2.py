@@ -114,18 +114,18 @@ def notes(results: Results, cells: list[Cell]) -> list[str]:
 
 
 def to_rows(results: Results, cells: list[Cell]) -> tuple[list[str], list[list[str]]]:
-    """The table as text: a header, and a row for each game, kind of levels and of actions."""
-    algorithms = [a for a in results.suite.algorithms if any(c.algorithm == a for c in cells)]
-    header = ["levels", *(x for a in algorithms for x in (a, f"{a}, paper"))]
-    found = {(c.environment, c.policy, c.split, c.algorithm): c for c in cells}
-    games, rows = results.suite.environments, []
-    for game, policy, split in itertools.product(games, POLICIES, SPLITS):
-        row = [f"{split}, {policy}" if len(games) == 1 else f"{game}: {split}, {policy}"]
-        for algorithm in algorithms:
-            cell = found.get((game, policy, split, algorithm))
-            paper = cell.paper if cell else None
-            row += [cell.text if cell else "", "" if paper is None else f"{paper:.1f}"]
-        rows.append(row)
+    """The table as text: a header, and a row for each agent."""
+    header = ["agent"]
+    for policy, split in itertools.product(POLICIES, SPLITS):
+        paper = [f"{split}, paper"] if policy == "sampled" else []
+        header += [split if paper else f"{split}, greedy", *paper]
+    suite, rows = results.suite, []
+    for game, algorithm in itertools.product(suite.environments, suite.algorithms):
+        row = [algorithm if len(suite.environments) == 1 else f"{game}: {algorithm}"]
+        for cell in (c for c in cells if (c.environment, c.algorithm) == (game, algorithm)):
+            paper = ["" if cell.paper is None else f"{cell.paper:.1f}"]
+            row += [cell.text, *(paper if cell.policy == "sampled" else [])]
+        rows += [row] if len(row) > 1 else []
     return header, rows
 
 
@@ -143,18 +143,13 @@ def to_frame(cells: list[Cell]) -> pd.DataFrame:
 
 
 def to_rich(results: Results, cells: list[Cell]) -> Table:
-    """The table for a terminal, an agent to a line."""
+    """The table for a terminal."""
     header, rows = to_rows(results, cells)
     table = Table(title=f"{results.suite.name}: success rate on CoinRun levels, %")
-    table.add_column("agent")
+    for name in header:
+        table.add_column(name, justify="left" if name == "agent" else "right")
     for row in rows:
-        table.add_column(row[0], justify="right")
-    for i, name in enumerate(header[1::2]):
-        texts = []
-        for row in rows:
-            ours, paper = row[1 + 2 * i], row[2 + 2 * i]
-            texts.append(f"{ours}\n[dim]paper {paper}[/]" if paper else ours)
-        table.add_row(name, *texts)
+        table.add_row(*row)
     return table
 
 
@@ -170,8 +165,9 @@ def generalization_claim(results: Results) -> Claim:
         for split in SPLITS:
             gains = [rates[f"{plain} reg"][k][split] - rates[plain][k][split] for k in sorted(both)]
             estimate = estimate_mean(np.array(gains))
-            about = f"{plain} reg - {plain}: success, {split} levels"
-            findings.append(Finding(about, environment, estimate, verdict(estimate, +1)))
+            about, games = f"reg - plain: success, {split} levels", results.suite.environments
+            agent = plain if len(games) == 1 else f"{environment}: {plain}"
+            findings.append(Finding(about, agent, estimate, verdict(estimate, +1)))
     claim = Claim("d", STATEMENT, agreed([f.verdict for f in findings]), findings)
     short = any(len(results.metrics[run_id]) < MIN_UPDATES for run_id in results.evaluations)
     return without_verdict(claim) if short else claim
@@ -200,9 +196,9 @@ def success_curves(results: Results, path: Path) -> None:
         for row, (measure, label) in enumerate(measures):
             axis: Any = axes[row, column]
             tidy(axis)
-            for name, color, kind in zip((plain, f"{plain} reg"), COLORS, ("plain", "reg"),
-                                         strict=False):  # fmt: skip
-                draw_curves(axis, _by_update(results, game, name, measure), kind, color)
+            for name, kind, style in ((plain, "plain", "-"), (f"{plain} reg", "reg", "--")):
+                curves = _by_update(results, game, name, measure)
+                draw_curves(axis, curves, kind, COLORS[kind == "reg"], style)
             if measure.startswith("eval"):
                 axis.set_ylim(-0.03, 1.03)
             title = plain if len(games) == 1 else f"{game}: {plain}"

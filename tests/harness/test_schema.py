@@ -49,16 +49,16 @@ def test_an_unknown_name_is_answered_with_the_closest_or_with_all():
 
 
 def test_games_are_checked_by_their_baseline_and_tasks_by_gymnasium():
-    check_args("ppo_reg_coinrun", COINRUN, "here")
+    check_args("ppo_reg_coinrun", COINRUN, {}, "here")
     with pytest.raises(SuiteError, match=r"here: env_id must be one of .*coinrun.*got 'coinrum'"):
-        check_args("ppo_reg_coinrun", COINRUN | {"env_id": "coinrum"}, "here")
+        check_args("ppo_reg_coinrun", COINRUN | {"env_id": "coinrum"}, {}, "here")
     with pytest.raises(SuiteError, match="coinrun"):
-        check_args("ppo_reg", {"env_id": "coinrun"}, "here")
+        check_args("ppo_reg", {"env_id": "coinrun"}, {}, "here")
 
 
 def test_what_is_no_baseline_is_refused():
     with pytest.raises(SuiteError, match="here: baseline 'ppo' cannot be imported"):
-        check_args("ppo", COINRUN, "here")
+        check_args("ppo", COINRUN, {}, "here")
 
 
 def test_a_suite_that_only_includes_others_needs_no_algorithms(tmp_path):
@@ -131,3 +131,17 @@ def test_an_evaluation_is_a_table(suite_file, value):
     suite_file.write_text(f"evaluation = {value}\n{suite_file.read_text()}")
     with pytest.raises(SuiteError, match=r"tiny\.toml: evaluation must be of type .*dict"):
         read(str(suite_file))
+
+
+@pytest.mark.parametrize(
+    ("baseline", "levels", "message"),
+    [
+        ("ppo_reg", 1, "1 levels to be evaluated on, but it is trained on no countable ones"),
+        ("ppo_reg_coinrun", 501, "501 levels to be evaluated on, but it is trained on 500"),
+    ],
+)
+def test_an_evaluation_that_cannot_be_is_refused_before_training(baseline, levels, message):
+    env_id = "coinrun" if baseline == "ppo_reg_coinrun" else "Pendulum-v1"
+    args = {"env_id": env_id, "total_timesteps": 10_000}
+    with pytest.raises(SuiteError, match=message):
+        check_args(baseline, args, {"levels": levels, "repeats": 1}, "here")

@@ -11,7 +11,7 @@ from collections import Counter
 import pytest
 import tyro
 
-from harness.schema import SuiteError, suite_names
+from harness.schema import SUITES, SuiteError, suite_names
 from harness.statistics import MIN_AGENTS
 from harness.suite import load_suite
 
@@ -319,10 +319,14 @@ def test_the_ablation_sweeps_every_part_of_the_penalty():
             assert (run.args["coefficient"], run.args["perturb_obs"]) == (0.0, True)
 
 
-def test_an_evaluation_is_of_every_run_and_in_its_hash(suite_file):
-    plain = load_suite(str(suite_file)).runs
-    suite_file.write_text(suite_file.read_text() + "\n[evaluation]\nlevels = 3\nrepeats = 2\n")
-    evaluated = load_suite(str(suite_file)).runs
+def test_an_evaluation_is_of_every_run_and_in_its_hash(tmp_path):
+    path, text = tmp_path / "tiny.toml", (SUITES / "smoke_coinrun.toml").read_text()
+    asked = "[evaluation]\nlevels = 2\nrepeats = 2\n"
+    assert asked in text
+    path.write_text(text.replace(asked, ""))
+    plain = load_suite(str(path)).runs
+    path.write_text(text.replace("levels = 2", "levels = 3"))
+    evaluated = load_suite(str(path)).runs
     assert all(run.evaluation == {"levels": 3, "repeats": 2} for run in evaluated)
     assert all(run.evaluation == {} for run in plain)
     assert [run.args for run in plain] == [run.args for run in evaluated]
