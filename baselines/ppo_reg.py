@@ -436,7 +436,7 @@ class Learner:
         self.generators = {n: torch.Generator().manual_seed(seeds[n]) for n in names[:3]}
         self.actor = Actor(args, obs_dim, action_dim, self.generators["init"])
         self.critic = make_mlp(args, obs_dim, 1, 1.0, self.generators["init"])
-        adam = functools.partial(torch.optim.Adam, eps=1e-5)
+        adam = functools.partial(torch.optim.Adam, eps=1e-5, fused=True)
         self.actor_optimizer = adam(self.actor.parameters(), args.learning_rate)
         self.critic_optimizer = adam(self.critic.parameters(), args.vf_learning_rate)
         self.regularizer = args.regularizer(args.coefficient, seeds["penalty"])  # condwrap
