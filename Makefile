@@ -27,9 +27,11 @@ check: $(INSTALLED)  ## lint, format, types and the direction of imports
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(INSTALLED)  ## benchmarks, ratios within one run
-	$(BIN)/python -m pytest tests/benchmarks --benchmark-enable --benchmark-only \
-		--benchmark-group-by=group --benchmark-columns=median,iqr,rounds --benchmark-sort=name
+bench: $(INSTALLED)  ## benchmarks beside their peers, as one table; a quarter of an hour
+	$(BIN)/python -m pip install --quiet --no-deps stable-baselines3==2.9.2 sb3-contrib==2.9.2
+	$(BIN)/python -m pytest tests/benchmarks --benchmark-enable --benchmark-only --quiet \
+		--benchmark-json=benchmarks.json --benchmark-columns=median
+	$(BIN)/python -m tests.benchmarks.table benchmarks.json
 
 $(INSTALLED): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

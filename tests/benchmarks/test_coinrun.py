@@ -103,6 +103,9 @@ def test_coinrun(benchmark, threads, network, kind):
     benchmark.group = f"CoinRun PPO, {network}, {threads} threads, 2048 steps"
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
+    benchmark.extra_info.update(
+        {"peer": True} if kind.startswith("peer") else {"goal": 1}, steps=2048
+    )
     maker, changes = KINDS[kind]
     loop = maker(ours.Args(**SMALL, network=network, **changes))
     rounds = 3 if network == "nature" else 1

@@ -32,6 +32,8 @@ def test_environment(benchmark, name, kind):
                 env.reset()
 
     benchmark.group = f"{STEPS} random steps, {name}"
+    goal = 1.3 if name in ("Reacher", "InvertedDoublePendulum") else 1.8
+    benchmark.extra_info.update({"peer": True} if kind == "stock" else {"goal": goal}, steps=STEPS)
     benchmark.pedantic(play, rounds=11, warmup_rounds=1)
     assert env.unwrapped.physicsClientId >= 0
     env.close()

@@ -1,0 +1,113 @@
+"""PPO and TRPO, steps a second: rollout, update and psi, beside SB3's and the bare environment.
+
+Ours play the fast tasks, the peers the stock ones, which take the same steps. The peers come with
+`make bench`; without them their part is skipped.
+"""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+from baselines import ppo_reg, ppo_reg_population, trpo_reg, trpo_reg_population
+
+TASKS = {"Hopper": 3, "Humanoid": 1, "InvertedDoublePendulum": 3}  # rounds
+AGENTS = 10
+GOALS = {  # times SB3's speed
+    ("PPO", "Hopper"): 4.0, ("PPO", "Humanoid"): 2.7, ("PPO", "InvertedDoublePendulum"): 5.0,
+    ("TRPO", "Hopper"): 3.0, ("TRPO", "Humanoid"): 2.3, ("TRPO", "InvertedDoublePendulum"): 3.0,
+}  # fmt: skip
+
+
+def fast(task: str) -> str:
+    return f"harness.envs.fast_bullet:Fast{task}BulletEnv-v0"
+
+
+def run(benchmark, algorithm: str, task: str, iterate, steps: int, **about) -> None:
+    benchmark.group = f"{algorithm}, {task}"
+    benchmark.extra_info.update(steps=steps, **about)
+    torch.set_num_threads(1)
+    benchmark.pedantic(iterate, rounds=TASKS[task], warmup_rounds=1)
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("algorithm", ["PPO", "TRPO"])
+def test_peer(benchmark, algorithm, task):
+    library = pytest.importorskip("stable_baselines3" if algorithm == "PPO" else "sb3_contrib")
+    from stable_baselines3.common.monitor import Monitor
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+    env_id = f"pybullet_envs_gymnasium:{task}BulletEnv-v0"
+    venv = VecNormalize(DummyVecEnv([lambda: Monitor(gym.make(env_id))]))
+    model = getattr(library, algorithm)("MlpPolicy", venv, device="cpu", seed=1)
+
+    def iterate():
+        model.learn(2048, reset_num_timesteps=False)
+
+    run(benchmark, algorithm, task, iterate, 2048, peer=True)
+    venv.close()
+
+
+@pytest.mark.parametrize("coefficient", [0.0, 1e-3])
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("algorithm", ["PPO", "TRPO"])
+def test_single(benchmark, algorithm, task, coefficient):
+    baseline = ppo_reg if algorithm == "PPO" else trpo_reg
+    args = baseline.Args(env_id=fast(task), coefficient=coefficient)
+    learner = baseline.Learner(args)
+    envs = baseline.make_envs(args, 0, learner.stats)
+    state = {"obs": envs.reset(seed=1)[0]}
+
+    def iterate():
+        data = baseline.rollout(args, learner, envs, state["obs"])
+        losses = baseline.update(args, learner, data)
+        learner.update += 1
+        state["obs"] = data.next_obs
+        baseline.make_row(args, learner, data, losses, 0.0)
+
+    goal = {"goal": 1.5} if algorithm == "PPO" else {}
+    run(benchmark, algorithm, task, iterate, args.batch_size, **goal)
+    envs.close()
+
+
+@pytest.mark.parametrize("coefficient", [0.0, 1e-3])
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("algorithm", ["PPO", "TRPO"])
+def test_population(benchmark, algorithm, task, coefficient):
+    program = ppo_reg_population if algorithm == "PPO" else trpo_reg_population
+    population = program.population
+    args = program.Args(env_id=fast(task), coefficient=coefficient, num_agents=AGENTS)
+    learners = [args.single.Learner(each) for each in args.runs]
+    envs = population.make_envs(args, 0, learners)
+    state = {"obs": envs.reset(seed=list(range(AGENTS)))[0]}
+
+    def iterate():
+        rollouts = population.rollout(args, learners, envs, state["obs"])
+        state["obs"] = np.concatenate([data.next_obs for data in rollouts])
+        losses = program.update(args, learners, rollouts)
+        for each, learner, *row in zip(args.runs, learners, rollouts, losses, strict=True):
+            learner.update += 1
+            args.single.make_row(each, learner, *row, 0.0)
+
+    goal = GOALS[algorithm, task]
+    run(benchmark, algorithm, task, iterate, AGENTS * args.batch_size, goal=goal)
+    envs.close()
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("kind", ["stock", "fast"])
+def test_environment_alone(benchmark, kind, task):
+    env = gym.make(fast(task) if kind == "fast" else f"pybullet_envs_gymnasium:{task}BulletEnv-v0")
+    env.reset(seed=1)
+    env.action_space.seed(1)
+
+    def iterate():
+        for _ in range(2000):
+            _, _, ended, cut, _ = env.step(env.action_space.sample())
+            if ended or cut:
+                env.reset()
+
+    run(benchmark, "PPO", task, iterate, 2000)
+    env.close()
