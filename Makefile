@@ -29,7 +29,7 @@ check: $(INSTALLED)  ## lint, format, types and the direction of imports
 
 bench: $(INSTALLED)  ## benchmarks beside their peers, as one table; a quarter of an hour
 	$(BIN)/python -m pip install --quiet --no-deps stable-baselines3==2.9.2 sb3-contrib==2.9.2
-	$(BIN)/python -m pytest tests/benchmarks --benchmark-enable --benchmark-only --quiet \
+	$(BIN)/python -m pytest tests/benchmarks --benchmark-enable --benchmark-only --quiet -m '' \
 		--benchmark-json=benchmarks.json --benchmark-columns=median
 	$(BIN)/python -m tests.benchmarks.table benchmarks.json
 

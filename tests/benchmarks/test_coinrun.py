@@ -16,6 +16,8 @@ from torch.distributions import Categorical
 
 from baselines import ppo_reg_coinrun as ours
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("envpool")
 SMALL = {"num_envs": 32, "num_steps": 64, "num_minibatches": 2, "update_epochs": 1}
 SMALL |= {"total_timesteps": 10_000_000, "eval_interval": 0}

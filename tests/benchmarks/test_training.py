@@ -13,6 +13,8 @@ import torch
 
 from baselines import ppo_reg, ppo_reg_population, trpo_reg, trpo_reg_population
 
+pytestmark = pytest.mark.slow
+
 TASKS = {"Hopper": 3, "Humanoid": 1, "InvertedDoublePendulum": 3}  # rounds
 AGENTS = 10
 GOALS = {  # times SB3's speed
