@@ -11,6 +11,7 @@ import jinja2
 from rich.table import Table
 
 from harness.report import claims, figures, study, table1, table2
+from harness.report.cost import cost_claim
 from harness.report.results import Results
 from harness.statistics import MIN_AGENTS
 
@@ -40,6 +41,8 @@ def write_report(results: Results, folder: Path) -> tuple[list[Section], list[cl
         claim = table2.generalization_claim(levels)
         found += [claim] if claim.findings else []
         sections.append(_levels(levels, claim, folder))
+    cost = cost_claim(results)
+    found += [cost] if cost.findings else []
     claims.to_frame(found).to_csv(folder / "claims.csv", index=False)
     page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(
         (Path(__file__).parent / "page.html").read_text()

@@ -160,7 +160,8 @@ def test_few_runs_make_a_page_without_a_verdict(store, suite, report, runs):
 
 def test_the_page_says_the_verdicts(written):
     claims, page = written.claims, written.page
-    assert [claim.verdict for claim in claims] == ["supported", "not supported"]
+    found = {claim.letter: claim.verdict for claim in claims}
+    assert found == {"a": "supported", "b": "not supported", "e": "too few runs to tell"}
     rows = {cells[0]: cells[1].strip() for cells in page.cells if cells[0].startswith("(")}
     assert rows == {f"({c.letter}) {c.statement}": c.verdict for c in claims}
 
@@ -170,7 +171,8 @@ def test_only_what_is_supported_looks_so(written):
     page = written.page
     coloured = {text: set(name.split()) & {"supported", "contradicted"}
                 for name, text in page.verdicts}  # fmt: skip
-    assert coloured == {"supported": {"supported"}, "not supported": set()}
+    plain = {"not supported": set(), "too few runs to tell": set()}
+    assert coloured == {"supported": {"supported"}, **plain}
 
 
 def test_the_page_has_every_number_behind_the_verdicts(written):
@@ -295,7 +297,7 @@ def test_a_page_of_games_has_table_2_and_nothing_of_table_1(games, report):
     assert [h for h in page.headings if h.startswith("Table")] == [
         "Table 2: success rate on CoinRun levels, %, beside the paper's"
     ]
-    assert [claim.letter for claim in claims] == ["d"]
+    assert [claim.letter for claim in claims] == ["d", "e"]
     assert [image["src"] for image in page.images] == ["figure4.png", "claim_d.png"]
     names = {path.name for path in folder.iterdir()}
     assert names == {
@@ -307,7 +309,7 @@ def test_a_page_of_games_has_table_2_and_nothing_of_table_1(games, report):
     assert rows["PPO"][6] == "0.0 [0.0, 0.0]"
     assert "The agent's velocity is painted into the frame" in page.text
     assert len(pd.read_csv(folder / "table2.csv")) == 2 * 4
-    assert pd.read_csv(folder / "claims.csv")["claim"].tolist() == ["d", "d"]
+    assert pd.read_csv(folder / "claims.csv")["claim"].tolist() == ["d", "d", "e"]
 
 
 def test_a_page_of_control_tasks_has_nothing_of_table_2(written):
@@ -332,7 +334,7 @@ def test_a_page_of_both_has_both(games, report, store, suite):
     )  # fmt: skip
     folder, claims, page = report(merged)
     assert [h[:7] for h in page.headings if h.startswith("Table")] == ["Table 1", "Table 2"]
-    assert [claim.letter for claim in claims] == ["a", "d"]
+    assert [claim.letter for claim in claims] == ["a", "d", "e"]
     task = next(cells for cells in page.cells if cells[0] == "Hopper")
     assert task[1] == "1.5"
     assert "CoinRun" not in [cells[0] for cells in page.cells]  # no row of Table 1
@@ -366,11 +368,12 @@ def test_the_verdict_of_claim_d_is_on_the_page(games, report):
         )
 
     _, _, page = report(games(episodes=better, updates=MIN_UPDATES, seeds=seeds))
-    assert [text for _, text in page.verdicts] == ["supported"]
+    assert [text for _, text in page.verdicts] == ["supported", "supported"]
     rows = [cells for cells in page.cells if len(cells) == 6 and cells[0] != "about"]
     assert [(row[0], row[2], row[3], row[4]) for row in rows] == [
         ("reg - plain: success, seen levels", "0.5", "0.5 to 0.5", "10"),
         ("reg - plain: success, unseen levels", "0.5", "0.5 to 0.5", "10"),
+        ("reg / plain - 1: time for a step, CoinRun", "0", "0 to 0", "10"),
     ]
 
 
