@@ -305,25 +305,20 @@ def start(module, folder, *flags: str) -> subprocess.Popen:
     for copied in (population, single_of(module), module):
         shutil.copy(copied.__file__, folder)
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
-    command = [sys.executable, f"{name(module)}.py", *FLAGS, "--num-agents=2", *flags]
+    own = ["--env-id=Pendulum-v1", "--num-agents=2"]
+    command = [sys.executable, f"{name(module)}.py", *FLAGS, *own, *flags]
     with open(folder / "log.txt", "w") as log:
         return subprocess.Popen(command, cwd=folder, env=environment, stdout=log, stderr=log)
 
 
 def test_it_runs_when_copied_beside_the_single_file(module, tmp_path):
-    assert start(module, tmp_path, "--total-timesteps=128").wait() == 0, (
-        tmp_path / "log.txt"
-    ).read_text()
-    assert "update 2/2" in (tmp_path / "log.txt").read_text()
+    ended = start(module, tmp_path, "--total-timesteps=128").wait()
+    log = (tmp_path / "log.txt").read_text()
+    assert ended == 0, log
+    assert "update 2/2" in log
     for agent in range(2):
-        assert (
-            len(
-                read_metrics(
-                    tmp_path / f"runs/Pendulum-v1__{name(single_of(module))}__s1__a{agent}"
-                )
-            )
-            == 2
-        )
+        run = tmp_path / "runs" / f"Pendulum-v1__{name(single_of(module))}__s1__a{agent}"
+        assert len(read_metrics(run)) == 2
 
 
 def test_a_killed_process_continues_as_if_undisturbed(tmp_path):
