@@ -414,7 +414,8 @@ def load_checkpoints(args: PopulationArgs) -> list[dict[str, Any] | None]:
     for i in ahead:
         path = runs[i].path / "checkpoint.previous.pt"
         before = torch.load(path, weights_only=True)["learner"]["update"] if path.exists() else 0
-        if before != min(updates):
+        begun = all((run.path / "metrics.csv").exists() for run in runs)  # none is a newcomer
+        if before != min(updates) or not begun:
             steps = ", ".join(f"{u} (agent {r.agent})" for u, r in zip(updates, runs, strict=True))
             how = f"resume each by {args.single_file}"
             raise single.RunError(f"the agents are at updates {steps}: {how}")

@@ -52,7 +52,8 @@ class Args:
     agent: int = 0
     """number of the agent, for several of one seed"""
     total_timesteps: int = 50_000_000
-    """environment steps to train for, rounded down to whole updates"""
+    """steps to train for, rounded down to whole updates; those that EnvPool spends on resets count
+    here, and not in global_step"""
     num_levels: int = 500
     """levels to train on; 0: without bound"""
     start_level: int = 0
@@ -236,9 +237,9 @@ class Procgen(VectorEnv):
             if value not in known:
                 raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
         numbers = {"num_levels": num_levels, "start_level": start_level, "num_threads": num_threads}
-        for name, number in {**numbers, "num_envs": num_envs - 1}.items():
-            if number < 0:
-                raise ValueError(f"{name} must not be negative, or num_envs 0, got {number}")
+        for name, number in {**numbers, "num_envs": num_envs}.items():
+            if number < AT_LEAST[name]:
+                raise ValueError(f"{name} must be at least {AT_LEAST[name]}, got {number}")
         self.num_envs = num_envs
         self.metadata = {"autoreset_mode": ENGINES[backend].autoreset_mode}
         self.single_observation_space = gym.spaces.Box(0, 255, (3, 64, 64), np.uint8)
@@ -832,6 +833,9 @@ class Learner:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         for name in TRAINED:
             getattr(self, name).load_state_dict(state[name])
+        for weights, moments in self.optimizer.state.items():  # fused Adam pairs them in memory
+            for key in ("exp_avg", "exp_avg_sq"):  # order, which differs between CPU and GPU
+                moments[key] = torch.empty_like(weights).copy_(moments[key])
         for name, rms in self.stats.items():
             vars(rms).update({key: x.numpy() for key, x in state[name].items()})
         for name, generator in self.generators.items():
@@ -910,6 +914,7 @@ def train(args: Args) -> Learner:
     saved = load_checkpoint(args)
     torch.set_num_threads(args.num_threads or torch.get_num_threads())
     torch.set_float32_matmul_precision("high")  # TensorFloat-32 on a GPU, as convolutions have it
+    make_envs(args, 0)  # a missing engine is told of before there is a folder
     learner = Learner(args)
     if saved:
         learner.load_state_dict(saved["learner"])

@@ -122,9 +122,15 @@ def _parameter(distribution: td.Distribution, output: str) -> Tensor:
 
 
 def check_reusable(policy: Policy) -> None:
-    """Raise if the policy's answer in training differs from what `untouched` would give."""
+    """Raise if a module would answer otherwise in `untouched`: dropout and batch norm in training.
+
+    Dropout by a function, such as `F.dropout`, cannot be seen.
+    """
     for module in _modules(policy):
-        if module.training and isinstance(module, (_NormBase, nn.modules.dropout._DropoutNd)):
+        rate = getattr(module, "dropout", 0.0)  # of recurrent layers and attention
+        drops = isinstance(rate, float) and rate > 0
+        kinds = (_NormBase, nn.modules.dropout._DropoutNd)
+        if module.training and (drops or isinstance(module, kinds)):
             raise ValueError(
                 f"answer cannot be used with {type(module).__name__} in training mode, which would "
                 "count as sensitivity: leave answer out"

@@ -78,7 +78,8 @@ def run_all(
         f"{done} done before, {len(todo)} to do, {jobs} at a time."
     )
     if dry_run:
-        show_costs(measure(make_groups(todo, store, jobs, plain), jobs, console), jobs)
+        if todo:
+            show_costs(measure(make_groups(todo, store, jobs, plain), jobs, console), jobs)
         return
     outcome = Outcome()
     if todo:
@@ -200,7 +201,7 @@ def show_others(results: Results) -> None:
     speed = {
         (run.baseline, run.environment): results.metrics[run.run_id]["charts/SPS"].iloc[-1]
         for run in results.suite.runs
-        if run.run_id in results.metrics
+        if run.run_id in results.metrics and not run.evaluation  # too short here to tell
     }
     for name in suite_names():
         if name == results.suite.name:
@@ -210,7 +211,7 @@ def show_others(results: Results) -> None:
             r.args["total_timesteps"] / speed.get((r.baseline, r.environment), math.nan)
             for r in other.runs
         )
-        cost = "" if math.isnan(seconds) else (
+        cost = " (--dry-run says how long)" if math.isnan(seconds) else (
             f", about {seconds / 3600:,.0f} core-hours, {duration(seconds / cores())} here"
         )  # fmt: skip
         what = f"{len(other.runs)} runs, {other.timesteps:,} steps"

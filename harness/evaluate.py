@@ -135,11 +135,18 @@ def evaluate_run(
         content = (path / "checkpoint.pt").read_bytes()
     except FileNotFoundError:
         raise EvaluationError(f"{path} holds no checkpoint.pt: train it first") from None
-    about = {"levels": levels, "repeats": repeats, "unseen": unseen}
+    asked = {"levels": levels, "repeats": repeats, "unseen": unseen}
+    about: dict[str, Any] = dict(asked)
     about["checkpoint_sha256"] = hashlib.sha256(content).hexdigest()
     kept = path / "evaluation.csv"
-    if read_json(path / "evaluation.json") == about and kept.exists():
+    before = read_json(path / "evaluation.json") or {}
+    if before == about and kept.exists():
         return pd.read_csv(kept)
+    known = {name: before.get(name) for name in asked}
+    if (path / "done.json").exists() and before and known != asked:
+        raise EvaluationError(
+            f"{path} is a suite's run, evaluated with {known}: copy it to evaluate it otherwise"
+        )
     agent, args = load_agent(path / "checkpoint.pt", device)
     chosen = choose_levels(args, levels, unseen)
     try:
@@ -178,7 +185,7 @@ def load_agent(checkpoint: Path, device: str) -> tuple[Agent, Args]:
 
 
 def record(agent: Agent, args: Args, level: int, path: Path) -> None:
-    """The greedy agent's episode on a level, as an animated GIF."""
+    """The greedy agent's episode on a level, or its first GIF_FRAMES frames, as an animated GIF."""
     env = Levels(args, [level], 1)
     frames, pictures, device = env.reset(seed=0)[0], [], agent.mask.device
     agent.eval()

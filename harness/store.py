@@ -104,10 +104,9 @@ class Store:
             self.path(spec, "log.txt").write_text(about)
 
     def partners(self, spec: RunSpec) -> list[int]:
-        """Numbers of the agents that its process trains with it, itself included; [] if none."""
+        """Numbers of the agents that it was begun with, itself included; [] if it never was."""
         saved = read_json(self.path(spec, "spec.json"))
-        agents = [] if saved is None else saved.get("agents", [])
-        return agents if len(agents) > 1 else []
+        return [] if saved is None else saved.get("agents", [spec.args["agent"]])
 
     def finish(self, spec: RunSpec, returncode: int, seconds: float) -> None:
         """Mark the run complete, or failed."""

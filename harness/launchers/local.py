@@ -71,6 +71,9 @@ def run_local(groups: list[Group], store: Store, jobs: int, progress: Progress) 
                 if child is not None:
                     children.append(child)
                     continue
+                if len(group) > 1:  # some are another launcher's: see each for itself
+                    waiting.extendleft([spec] for spec in reversed(group))
+                    continue
                 for spec in group:
                     done = store.is_done(spec)
                     (outcome.done if done else outcome.held).append(spec)

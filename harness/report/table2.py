@@ -32,7 +32,8 @@ DEVIATIONS = (
     "update; the paper does not say where.",
     "Where delta comes from is not stated in the paper: here a random direction of length 1 over "
     "pixels in [0, 1]. pi(S) is the log-probabilities.",
-    "Time limits count as ends, as in the original engine. Weights begin orthogonal.",
+    "Time limits count as ends, as in the original engine. Weights begin orthogonal. The critic's "
+    "loss is not clipped; that of Lee et al. is, by the policy's clip range.",
 )
 
 

@@ -223,6 +223,16 @@ def test_agents_at_different_updates_are_left_as_they_are(module, tmp_path):
     assert (tmp_path / "a0" / "checkpoint.pt").read_bytes() == before
 
 
+def test_a_newcomer_does_not_undo_what_others_have(module, tmp_path):
+    """Finished agents with a single checkpoint, and one that was never begun beside them."""
+    args = arguments(module, tmp_path, **{**RESUMABLE, "checkpoint_interval": 100})
+    module.train(dataclasses.replace(args, num_agents=2))
+    assert not (tmp_path / "a0" / "checkpoint.previous.pt").exists()
+    with pytest.raises(args.single.RunError, match="the agents are at updates"):
+        module.train(dataclasses.replace(args, resume=True))
+    assert (tmp_path / "a0" / "checkpoint.pt").exists()
+
+
 def test_either_program_goes_on_where_the_other_was_stopped(module, tmp_path, monkeypatch):
     """From single files to the population and back; as all is saved, only rounding tells."""
     settings = {**RESUMABLE, "env_id": "test/Drift-v0"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 import sys
@@ -543,3 +544,20 @@ def test_it_learns(tmp_path):
     untrained = success_rate(Learner(args).agent)
     assert untrained < 0.25
     assert success_rate(train(args).agent) > untrained + 0.3
+
+
+def test_adams_moments_follow_the_weights_memory_format(tmp_path):
+    """A GPU keeps channels_last, and fused Adam pairs weights and moments in memory order."""
+    learner = train(coinrun(tmp_path, total_timesteps=64))
+    state = copy.deepcopy(learner.state_dict())
+    for moments in state["optimizer"]["state"].values():
+        if moments["exp_avg"].ndim == 4:
+            for key in ("exp_avg", "exp_avg_sq"):
+                moments[key] = moments[key].contiguous(memory_format=torch.channels_last)
+    resumed = ppo_reg_coinrun.Learner(coinrun(tmp_path, total_timesteps=64))
+    resumed.load_state_dict(state)
+    for each in (learner, resumed):
+        for weights_ in each.agent.parameters():
+            weights_.grad = torch.ones_like(weights_)
+        each.optimizer.step()
+    assert torch.equal(weights(learner), weights(resumed))

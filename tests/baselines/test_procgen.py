@@ -134,10 +134,10 @@ def test_closing_twice_and_resetting_after_it(make):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"num_levels": -1}, "num_levels must not be negative, or num_envs 0, got -1"),
-        ({"start_level": -5}, "start_level must not be negative"),
-        ({"num_threads": -2}, "num_threads must not be negative"),
-        ({"num_envs": 0}, "num_envs must not be negative, or num_envs 0"),
+        ({"num_levels": -1}, "num_levels must be at least 0, got -1"),
+        ({"start_level": -5}, "start_level must be at least 0, got -5"),
+        ({"num_threads": -2}, "num_threads must be at least 0, got -2"),
+        ({"num_envs": 0}, "num_envs must be at least 1, got 0"),
         ({"distribution_mode": "extreme"}, "must be one of easy, hard, got 'extreme'"),
         ({"game": "coinrunner"}, "game must be one of bigfish, .*, got 'coinrunner'"),
         ({"backend": "unity"}, "backend must be one of envpool, procgen, got 'unity'"),

@@ -84,3 +84,13 @@ def test_jvp_refuses_it():
     net, obs = mlp(), torch.randn(5, 4)
     with pytest.raises(ValueError, match="difference"):
         ConditioningRegularizer(estimator="jvp")(net, obs, answer=net(obs))
+
+
+def test_dropout_inside_a_recurrent_layer_is_refused():
+    gru, obs = nn.GRU(4, 4, num_layers=2, dropout=0.5), torch.randn(5, 4)
+
+    def policy(obs):
+        return gru(obs[:, None])[0][:, 0]
+
+    with pytest.raises(ValueError, match="GRU"):
+        ConditioningRegularizer()(policy, obs, answer=policy(obs))

@@ -356,6 +356,17 @@ def test_another_checkpoint_is_played(path, quick):
     assert len(quick.calls) == 4
 
 
+def test_the_evaluation_of_a_suites_run_is_not_overwritten(path, quick):
+    first = judge(path)
+    (path / "done.json").write_text("{}")
+    with pytest.raises(EvaluationError, match=r"a suite's run, evaluated with .*: copy it"):
+        judge(path, repeats=1)
+    pd.testing.assert_frame_equal(judge(path), first)
+    (path / "evaluation.csv").unlink()
+    judge(path)  # lost, and so made again
+    assert len(quick.calls) == 4
+
+
 def test_what_is_killed_before_its_last_file_is_played_again(path, quick, monkeypatch):
     judge(path)
 

@@ -55,6 +55,13 @@ def test_interrupted_agents_stay_with_those_they_were_begun_with(store):
     assert len(make_groups(runs[:2], store, jobs=8)) == 1  # even if cores stay idle
 
 
+def test_an_agent_that_was_begun_alone_is_not_joined_by_newcomers(store):
+    runs = [run for run in table1(seeds=1, agents=3) if run.algorithm == "PPO"]
+    store.start(runs[0], [], runs[:1])
+    made = make_groups(runs, store, jobs=1)
+    assert sorted(names(made)) == sorted([*names([runs[:1]]), *names([runs[1:]])])
+
+
 def test_every_run_is_in_one_group(store):
     runs = load_suite("paper").runs
     made = make_groups(runs, store, jobs=7)
