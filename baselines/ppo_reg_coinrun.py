@@ -781,6 +781,7 @@ class Learner:
         self.regularizer = args.regularizer(args.coefficient, rngs[0])  # condwrap
         self.probe = args.regularizer(0.0, rngs[1], args.probe_fraction)  # condwrap
         self.update, self.global_step = 0, 0
+        self.uploading = 0.0  # seconds
         self.sample, self.total_loss = sample, total_loss
         if args.bf16:
             self.sample = torch.autocast(self.device.type, torch.bfloat16)(sample)
@@ -796,11 +797,13 @@ class Learner:
 
     def upload(self, frames: np.ndarray, to: Tensor, group: int) -> None:
         """One copy on the CPU, by NumPy: PyTorch's would wake threads that the simulators need."""
-        if not self.on_gpu:
+        started = time.perf_counter()
+        if self.on_gpu:
+            np.copyto(self.staging[group].numpy(), frames)
+            to.copy_(self.staging[group], non_blocking=True)
+        else:
             np.copyto(to.numpy(), frames)
-            return
-        np.copyto(self.staging[group].numpy(), frames)
-        to.copy_(self.staging[group], non_blocking=True)
+        self.uploading += time.perf_counter() - started
 
     def draw_mask(self, args: Args) -> None:
         """Dropout's mask for a rollout and its update: the ratios of PPO begin at 1."""
@@ -936,7 +939,7 @@ def train(args: Args) -> Learner:
         learner.discounted[:] = 0
         for _ in range(min(args.checkpoint_interval, args.num_updates - learner.update)):
             learner.draw_mask(args)
-            times = [time.time()]
+            learner.uploading, times = 0.0, [time.time()]
             data = rollout(args, learner, envs, frames)
             times.append(time.time())
             losses = update(args, learner, data)
@@ -951,6 +954,7 @@ def train(args: Args) -> Learner:
                 **ended,
                 "charts/SPS": speed,
                 "charts/SPS_rollout": steps / (times[1] - times[0]),
+                "charts/SPS_transfer": steps / learner.uploading,
                 "charts/SPS_update": steps / (times[2] - times[1]),
                 **losses,
                 **evaluate(args, learner),
