@@ -145,9 +145,10 @@ class ConditioningRegularizer:
             ValueError: Empty or (outside compiled code) non-finite observations, a delta that
                 does not match, an output that lost the batch axes or has no gradient.
         """
-        states = self._read(obs)
+        given = States.read(obs, self.obs_scale, self.batch_ndim)
+        states = given.subset(self.fraction)
         flat_delta = self._draw(states) if delta is None else states.flatten(delta)
-        known = None if answer is None else self._known(policy, answer, obs)
+        known = None if answer is None else self._known(policy, answer, given)
         learns = self.coefficient > 0 and torch.is_grad_enabled()
 
         def respond(states_obs: Any) -> Tensor:
@@ -188,7 +189,7 @@ class ConditioningRegularizer:
             >>> ConditioningRegularizer(fraction=0.5).sample_delta(torch.ones(8, 3)).shape
             torch.Size([4, 3])
         """
-        states = self._read(obs)
+        states = States.read(obs, self.obs_scale, self.batch_ndim).subset(self.fraction)
         return states.unflatten(self._draw(states))
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -199,11 +200,7 @@ class ConditioningRegularizer:
         """Restore what `state_dict` returned."""
         self.generator.set_state(state_dict["generator"].cpu())
 
-    def _read(self, obs: Any) -> States:
-        return States.read(obs, self.obs_scale, self.batch_ndim).subset(self.fraction)
-
-    def _known(self, policy: Policy, answer: Any, obs: Any) -> Tensor:
-        states = States.read(obs, self.obs_scale, self.batch_ndim)
+    def _known(self, policy: Policy, answer: Any, states: States) -> Tensor:
         check_reusable(policy)
         output = flat_output(answer, self.output, states.batch, known=True)
         return dataclasses.replace(states, leaves=[output]).subset(self.fraction).leaves[0]
