@@ -917,13 +917,13 @@ def train(args: Args) -> Learner:
     saved = load_checkpoint(args)
     torch.set_num_threads(args.num_threads or torch.get_num_threads())
     torch.set_float32_matmul_precision("high")  # TensorFloat-32 on a GPU, as convolutions have it
-    make_envs(args, 0)  # a missing engine is told of before there is a folder
     learner = Learner(args)
     if saved:
         learner.load_state_dict(saved["learner"])
     if learner.update == args.num_updates:
         print(f"{args.path} is finished")
         return learner
+    make_envs(args, 0)  # a missing engine is told of before there is a folder
     args.path.mkdir(parents=True, exist_ok=True)
     first, started, printed = learner.global_step, time.time(), -math.inf
     with open(args.path / "metrics.csv", "a") as metrics:
