@@ -56,10 +56,9 @@ class States:
             )
         if math.prod(batch) == 0:
             raise ValueError(f"obs must not be empty, got shapes {shapes}")
-        if not torch.compiler.is_compiling():  # a graph holds no branch on data
-            for leaf in leaves:
-                if leaf.is_floating_point() and not torch.isfinite(leaf).all():
-                    raise ValueError("obs must be finite, got NaN or infinity")
+        checks = () if torch.compiler.is_compiling() else leaves  # a graph has no branch on data
+        if not all(_is_finite(leaf) for leaf in checks if leaf.is_floating_point()):
+            raise ValueError("obs must be finite, got NaN or infinity")
         return cls(leaves, scales, spec, batch_ndim)
 
     @property
@@ -112,8 +111,8 @@ class States:
         """What a flat delta, `[*batch, n]`, adds to each perturbed leaf, in that leaf's units."""
         parts = iter(torch.split(delta, self.sizes, -1))
         leaves = zip(self.leaves, self.scales, strict=True)
-        shifts = [(x, next(parts).reshape(x.shape) * scale) for x, scale in leaves if scale]
-        return [s.to(x.dtype) if x.is_floating_point() else s.float() for x, s in shifts]
+        shifts = [(x, next(parts).reshape(x.shape), scale) for x, scale in leaves if scale]
+        return [s.to(x.dtype) if x.is_floating_point() else s.float() * k for x, s, k in shifts]
 
     def unflatten(self, delta: Tensor) -> Any:
         """A flat delta, `[*batch, n]`, in the observation's structure; None where a leaf passes."""
@@ -148,6 +147,11 @@ def _scale(dtype: torch.dtype, obs_scale: float | None) -> float | None:
     if dtype == torch.bool:
         return None
     return IMAGE_SCALE if dtype == torch.uint8 and obs_scale is None else obs_scale
+
+
+def _is_finite(x: Tensor) -> bool:
+    # one NaN or infinity makes the sum such, as may the size of finite numbers
+    return math.isfinite(x.detach().sum()) or bool(torch.isfinite(x).all())
 
 
 def _shape(x: Any) -> tuple[int, ...] | str | None:

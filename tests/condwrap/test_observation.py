@@ -176,3 +176,16 @@ def test_flatten_refuses_a_delta_on_a_leaf_that_passes():
     delta = {name: x.float() for name, x in obs.items() if isinstance(x, Tensor)}
     with pytest.raises(ValueError, match="delta must match"):
         read(obs).flatten(delta)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+def test_a_single_value_that_is_not_finite_is_refused(bad):
+    obs = {"a": torch.ones(4, 3), "b": torch.ones(4, 2)}
+    obs["b"][2, 1] = bad
+    with pytest.raises(ValueError, match="obs must be finite"):
+        read(obs)
+
+
+def test_finite_observations_whose_sum_overflows_are_taken():
+    huge = torch.full((4, 3), torch.finfo(torch.float32).max, requires_grad=True)
+    assert read(huge).leaves[0] is huge
