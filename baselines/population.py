@@ -383,12 +383,11 @@ def value_step(args: PopulationArgs, critic: AdamStack, obs: Tensor, targets: Te
 
 
 def draw_delta(learners: list[Any], obs: Tensor, learns: np.ndarray) -> Tensor:  # condwrap
-    """What the regularizers of learning agents would draw in turn, `[M, N, b, n]`."""  # condwrap
-    noise = torch.ones(obs.shape, dtype=obs.dtype)  # condwrap
-    for agent in np.flatnonzero(learns):  # condwrap
-        for x in noise[:, agent]:  # condwrap
-            x.normal_(generator=learners[agent].regularizer.generator)  # condwrap
-    return learners[0].regularizer.perturbation(noise)  # condwrap
+    """What the learning agents' regularizers draw for the observations, `[N, B, n]`."""  # condwrap
+    delta = torch.ones_like(obs)  # condwrap
+    for i in np.flatnonzero(learns):  # condwrap
+        delta[i] = learners[i].regularizer.sample_delta(obs[i])  # condwrap
+    return delta  # condwrap
 
 
 def penalty_slope(args: Any, output: Tensor, delta: Tensor) -> Tensor:  # condwrap

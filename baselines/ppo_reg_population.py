@@ -44,9 +44,8 @@ class Batch(NamedTuple):
     targets: Tensor  # of the critic
 
 
-def minibatches(args: Args, learners: list[Any], batch: Batch) -> Batch:
+def minibatches(batch: Batch, order: Tensor) -> Batch:
     """An epoch: `[minibatches, N, b, ...]`, advantages normalized."""
-    order = population.shuffled(args, learners)
     epoch = Batch(*[x.flatten(0, 1)[order] for x in batch])
     std, mean = torch.std_mean(epoch.advantages, -1, keepdim=True)
     return epoch._replace(advantages=(epoch.advantages - mean) / (std + 1e-8))
@@ -110,12 +109,14 @@ def update(args: Args, learners: list[Any], rollouts: list[Any]) -> list[dict[st
     learns, epochs = np.ones(args.num_agents, bool), np.zeros(args.num_agents, int)
     logs, value_losses = [], []
     for epoch in range(max(args.update_epochs, args.vf_epochs)):
-        parts, seen = minibatches(args, learners, batch), []
+        order, seen = population.shuffled(args, learners), []
+        parts = minibatches(batch, order)
         learns = learns & (epoch < args.update_epochs)
         actor.learn(learns)
         deltas = [None] * args.num_minibatches
         if args.coefficient > 0 and learns.any():  # condwrap
-            deltas = population.draw_delta(learners, parts.obs, learns)  # condwrap
+            delta = population.draw_delta(learners, obs, learns)  # condwrap
+            deltas = delta.flatten(0, 1)[order]  # condwrap
         for *columns, delta in zip(*parts, deltas, strict=True):
             part = Batch(*columns)
             if learns.any():

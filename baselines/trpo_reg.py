@@ -176,6 +176,16 @@ MAY_CHANGE = {"run_dir", "resume", "capture_video", "track"}  # when a run is re
 # --- environment ----------------------------------------------------------------------------------
 
 
+class RunningMoments(RunningMeanStd):
+    """RunningMeanStd, which spares itself the moments of a batch of one."""
+
+    def update(self, x: np.ndarray) -> None:
+        if len(x) == 1:
+            self.update_from_moments(x[0], 0.0, 1)
+        else:
+            super().update(x)
+
+
 class NormalizeObservation(VectorWrapper):
     """(obs - mean) / std by running statistics, clipped; `final_obs` too, unlike Gymnasium's own.
 
@@ -206,7 +216,7 @@ class NormalizeObservation(VectorWrapper):
 
     def normalize(self, obs: np.ndarray) -> np.ndarray:
         scaled = (obs - self.rms.mean) / np.sqrt(self.rms.var + 1e-8)
-        return np.clip(scaled, -CLIP, CLIP).astype(np.float32)
+        return scaled.clip(-CLIP, CLIP).astype(np.float32)
 
 
 def make_env(args: Args, index: int, checkpoint: int) -> gym.Env:
@@ -230,14 +240,14 @@ def make_envs(args: Args, checkpoint: int, stats: dict[str, RunningMeanStd]) -> 
     scheduled checkpoint, and an interrupted run sees the same episodes as an undisturbed one.
     """
     makers = [functools.partial(make_env, args, i, checkpoint) for i in range(args.num_envs)]
-    envs: VectorEnv = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
+    envs: VectorEnv = SyncVectorEnv(makers, copy=False, autoreset_mode=AutoresetMode.SAME_STEP)
     envs = RecordEpisodeStatistics(envs)
     if args.norm_obs:
         shape = envs.single_observation_space.shape
-        envs = NormalizeObservation(envs, stats.setdefault("obs_rms", RunningMeanStd(shape=shape)))
+        envs = NormalizeObservation(envs, stats.setdefault("obs_rms", RunningMoments(shape=shape)))
     if args.norm_reward:
         envs = NormalizeReward(envs, gamma=args.gamma)
-        envs.return_rms = stats.setdefault("return_rms", envs.return_rms)
+        envs.return_rms = stats.setdefault("return_rms", RunningMoments())
     if args.perturb_obs:  # condwrap
         envs = VectorPerturbObservation(envs, args.perturbation, args.radius)  # condwrap
     return envs
@@ -312,7 +322,7 @@ def rollout(args: Args, learner: Learner, envs: VectorEnv, next_obs: np.ndarray)
         obs[t] = next_obs
         actions[t] += actor.mean(torch.from_numpy(obs[t]))
         action = actions[t].numpy().reshape(-1, *space.shape)
-        next_obs, rewards[t], ends[t], cut, info = envs.step(np.clip(action, space.low, space.high))
+        next_obs, rewards[t], ends[t], cut, info = envs.step(action.clip(space.low, space.high))
         after[t], dones[t] = next_obs, np.maximum(ends[t], cut)
         for i in np.flatnonzero(dones[t]):
             after[t, i] = info["final_obs"][i]

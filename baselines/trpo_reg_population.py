@@ -197,7 +197,7 @@ def update(args: Args, learners: list[Any], rollouts: list[Any]) -> list[dict[st
     delta = None
     if args.coefficient > 0:  # condwrap
         everyone = np.ones(args.num_agents, bool)  # condwrap
-        delta = population.draw_delta(learners, obs[None], everyone)[0]  # condwrap
+        delta = population.draw_delta(learners, obs, everyone)  # condwrap
     problem = Problem(args, actor, obs, actions, advantages, delta)
     logs, rejections = natural_step(args, actor, problem)
     for learner_args, reason in zip(args.runs, rejections, strict=True):

@@ -12,7 +12,15 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.utils import RunningMeanStd
 
 from baselines import ppo_reg
-from baselines.ppo_reg import Args, NormalizeObservation, Rollout, gae, policy_loss, train
+from baselines.ppo_reg import (
+    Args,
+    NormalizeObservation,
+    Rollout,
+    RunningMoments,
+    gae,
+    policy_loss,
+    train,
+)
 from tests.baselines.helpers import pendulum, read_metrics, weights
 
 
@@ -160,6 +168,16 @@ def test_frozen_statistics_stay():
     assert (rms.mean.item(), rms.var.item()) == (0.0, 1.0)
 
 
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_running_moments_are_gymnasiums_bit_for_bit(num_envs):
+    ours, theirs = RunningMoments(shape=(4,)), RunningMeanStd(shape=(4,))
+    for x in np.random.default_rng(0).normal(2.0, 3.0, (50, num_envs, 4)):
+        ours.update(x)
+        theirs.update(x)
+    np.testing.assert_array_equal([ours.mean, ours.var], [theirs.mean, theirs.var])
+    assert ours.count == theirs.count
+
+
 def test_observations_are_clipped():
     envs, _ = normalized_counts(update=False)
     assert envs.normalize(np.array([[1e6]])).item() == 10.0
@@ -219,6 +237,23 @@ def test_target_kl_ends_the_policys_epochs(tmp_path):
     one_epoch = train(pendulum(ppo_reg, tmp_path / "a", update_epochs=1))
     stopped = train(pendulum(ppo_reg, tmp_path / "b", update_epochs=2, target_kl=1e-9))
     assert torch.equal(weights(one_epoch), weights(stopped))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("coefficient", [0.0, 0.1])
+def test_compiled_losses_are_those_of_eager_code(tmp_path, coefficient):
+    rows = []
+    for compiled in (False, True):
+        torch.compiler.reset()
+        folder = tmp_path / f"compiled_{compiled}"
+        args = pendulum(ppo_reg, folder, coefficient=coefficient, compile=compiled)
+        learner = train(args)
+        assert (learner.actor_loss is ppo_reg.actor_loss) == (not compiled)
+        rows.append(read_metrics(folder))
+    for eager, compiled in zip(*rows, strict=True):
+        for column in ("losses/policy_loss", "losses/approx_kl", "conditioning/psi"):
+            close = pytest.approx(float(eager[column]), rel=1e-3, abs=1e-4)
+            assert float(compiled[column]) == close
 
 
 @pytest.mark.slow
