@@ -32,6 +32,7 @@ bench: $(INSTALLED)  ## benchmarks beside their peers, as one table; a quarter o
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-enable --benchmark-only --quiet -m '' \
 		--benchmark-json=benchmarks.json --benchmark-columns=median
 	$(BIN)/python -m tests.benchmarks.table benchmarks.json
+	$(BIN)/python -m tests.benchmarks.figure benchmarks.json benchmarks.png
 
 $(INSTALLED): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

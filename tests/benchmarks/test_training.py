@@ -6,6 +6,8 @@ Ours play the fast tasks, the peers the stock ones, which take the same steps. T
 
 from __future__ import annotations
 
+import contextlib
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -52,12 +54,9 @@ def test_peer(benchmark, algorithm, task):
     venv.close()
 
 
-@pytest.mark.parametrize("coefficient", [0.0, 1e-3])
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("algorithm", ["PPO", "TRPO"])
-def test_single(benchmark, algorithm, task, coefficient):
-    baseline = ppo_reg if algorithm == "PPO" else trpo_reg
-    args = baseline.Args(env_id=fast(task), coefficient=coefficient)
+@contextlib.contextmanager
+def single_iteration(baseline, task, **settings):
+    args = baseline.Args(env_id=fast(task), **settings)
     learner = baseline.Learner(args)
     envs = baseline.make_envs(args, 0, learner.stats)
     state = {"obs": envs.reset(seed=1)[0]}
@@ -69,21 +68,37 @@ def test_single(benchmark, algorithm, task, coefficient):
         state["obs"] = data.next_obs
         baseline.make_row(args, learner, data, losses, 0.0)
 
-    goal = {"goal": 1.5} if algorithm == "PPO" else {}
-    run(benchmark, algorithm, task, iterate, args.batch_size, **goal)
+    yield iterate, args.batch_size
     envs.close()
 
 
 @pytest.mark.parametrize("coefficient", [0.0, 1e-3])
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("algorithm", ["PPO", "TRPO"])
-def test_population(benchmark, algorithm, task, coefficient):
+def test_single(benchmark, algorithm, task, coefficient):
+    baseline = ppo_reg if algorithm == "PPO" else trpo_reg
+    goal = {"goal": 1.5} if algorithm == "PPO" else {}
+    with single_iteration(baseline, task, coefficient=coefficient) as (iterate, steps):
+        run(benchmark, algorithm, task, iterate, steps, **goal)
+
+
+@pytest.mark.parametrize("coefficient", [0.0, 1e-3])
+@pytest.mark.parametrize("task", TASKS)
+def test_compiled(benchmark, task, coefficient):
+    torch.compiler.reset()
+    settings = {"coefficient": coefficient, "compile": True}
+    with single_iteration(ppo_reg, task, **settings) as (iterate, steps):
+        run(benchmark, "PPO", task, iterate, steps, goal=1.5)
+
+
+@contextlib.contextmanager
+def population_iteration(algorithm, task, coefficient, agents):
     program = ppo_reg_population if algorithm == "PPO" else trpo_reg_population
     population = program.population
-    args = program.Args(env_id=fast(task), coefficient=coefficient, num_agents=AGENTS)
+    args = program.Args(env_id=fast(task), coefficient=coefficient, num_agents=agents)
     learners = [args.single.Learner(each) for each in args.runs]
     envs = population.make_envs(args, 0, learners)
-    state = {"obs": envs.reset(seed=list(range(AGENTS)))[0]}
+    state = {"obs": envs.reset(seed=list(range(agents)))[0]}
 
     def iterate():
         rollouts = population.rollout(args, learners, envs, state["obs"])
@@ -93,9 +108,17 @@ def test_population(benchmark, algorithm, task, coefficient):
             learner.update += 1
             args.single.make_row(each, learner, *row, 0.0)
 
-    goal = GOALS[algorithm, task]
-    run(benchmark, algorithm, task, iterate, AGENTS * args.batch_size, goal=goal)
+    yield iterate, agents * args.batch_size
     envs.close()
+
+
+@pytest.mark.parametrize("coefficient", [0.0, 1e-3])
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("algorithm", ["PPO", "TRPO"])
+def test_population(benchmark, algorithm, task, coefficient):
+    goal = GOALS[algorithm, task]
+    with population_iteration(algorithm, task, coefficient, AGENTS) as (iterate, steps):
+        run(benchmark, algorithm, task, iterate, steps, goal=goal)
 
 
 @pytest.mark.parametrize("task", TASKS)
