@@ -19,7 +19,7 @@ def table(content: dict) -> str:
     where = f"{cpu['brand_raw']}, {cpu['count']} cores, Python {machine['python_version']}"
     lines += [f"{content['datetime'][:10]}, {where}, `make bench`.",
               "Ratios are taken within one run; a step is one of one environment."]  # fmt: skip
-    benchmarks = sorted(content["benchmarks"], key=lambda b: b["group"] or "")
+    benchmarks = sorted(filter(in_table, content["benchmarks"]), key=lambda b: b["group"] or "")
     for group, found in groupby(benchmarks, key=lambda b: b["group"] or ""):
         found = list(found)
         peer = next((b for b in found if b["extra_info"].get("peer")), None)
@@ -32,6 +32,12 @@ def table(content: dict) -> str:
             name = b["name"].removeprefix("test_") + (" (peer)" if b is peer else "")
             lines.append(f"| {name} | {duration(b)} | {speed} | {ratio} | {goal} |")
     return "\n".join(lines) + "\n"
+
+
+def in_table(benchmark: dict) -> bool:
+    """Whether it has a goal or a peer, or at least is not there for the figure alone."""
+    info = benchmark["extra_info"]
+    return "panel" not in info or "goal" in info or "peer" in info
 
 
 def pace(benchmark: dict) -> float:
