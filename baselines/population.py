@@ -44,6 +44,8 @@ class PopulationArgs:
             raise ValueError(f"num_agents must be at least 1, got {self.num_agents}")
         if self.num_agents > 1 and self.run_dir and "{agent}" not in str(self.run_dir):
             raise ValueError(f"run_dir must hold {{agent}}, a folder for each, got {self.run_dir}")
+        if getattr(self, "compile", False):
+            raise ValueError(f"compile is for agents trained singly, by {self.single_file}")
         if self.track:
             raise ValueError(f"track follows one run: train agents singly, by {self.single_file}")
 
@@ -384,7 +386,7 @@ def value_step(args: PopulationArgs, critic: AdamStack, obs: Tensor, targets: Te
 
 def draw_delta(learners: list[Any], obs: Tensor, learns: np.ndarray) -> Tensor:  # condwrap
     """What the learning agents' regularizers draw for the observations, `[N, B, n]`."""  # condwrap
-    delta = torch.ones_like(obs)  # condwrap
+    delta = torch.ones_like(obs)  # of the others it does not matter  # condwrap
     for i in np.flatnonzero(learns):  # condwrap
         delta[i] = learners[i].regularizer.sample_delta(obs[i])  # condwrap
     return delta  # condwrap

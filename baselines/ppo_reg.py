@@ -173,7 +173,7 @@ MAY_CHANGE = {"run_dir", "resume", "capture_video", "track"}  # when a run is re
 
 
 class RunningMoments(RunningMeanStd):
-    """RunningMeanStd, which spares itself the moments of a batch of one."""
+    """RunningMeanStd, faster for a batch of one: its mean is itself and its variance 0."""
 
     def update(self, x: np.ndarray) -> None:
         if len(x) == 1:
@@ -403,6 +403,7 @@ def update(args: Args, learner: Learner, data: Rollout) -> dict[str, float]:
         policy_learns = policy_learns and epoch < args.update_epochs
         columns = [obs, actions, old_logprobs, advantages]
         if args.coefficient > 0 and policy_learns:  # condwrap
+            # for all minibatches at once, which is faster: a row for each state  # condwrap
             columns.append(learner.regularizer.sample_delta(obs))  # condwrap
         order = torch.randperm(len(obs), generator=learner.generators["minibatch"])
         for i in order.split(len(obs) // args.num_minibatches):

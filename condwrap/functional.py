@@ -25,8 +25,7 @@ def conditioning_quotient(
 
     J = ‖output - perturbed_output‖ / ‖delta‖, Euclidean norms over all axes but the first
     `batch_ndim`. Where delta is exactly 0 the divisor is taken as 1, so J is 0 there for a
-    deterministic policy. The gradient is 0, not NaN, where the two outputs are equal (PyTorch's
-    second derivative there is NaN: the norm has none).
+    deterministic policy. The gradient is 0, not NaN, where the two outputs are equal.
 
     Args:
         output: pi(S), `[*batch, *out_shape]`, floating.
@@ -110,8 +109,6 @@ def check_range(lambda_min: float, lambda_max: float) -> None:
 def safe_norm(x: Array) -> Array:
     """Euclidean norm over the last axis, `[..., n]` to `[...]`, with gradient 0 at 0."""
     xp = namespace(x=x)
-    if xp is array_api_compat.torch:  # one operation, whose gradient at 0 is 0
-        return torch.linalg.vector_norm(x, dim=-1)
     squares = xp.sum(x * x, axis=-1)
     zero = squares == 0  # not squares > 0: a NaN stays one
     # Two `where`s: with one alone, JAX multiplies the infinite slope of sqrt at 0 by 0.

@@ -56,8 +56,9 @@ class States:
             )
         if math.prod(batch) == 0:
             raise ValueError(f"obs must not be empty, got shapes {shapes}")
-        checks = () if torch.compiler.is_compiling() else leaves  # a graph has no branch on data
-        if not all(_is_finite(leaf) for leaf in checks if leaf.is_floating_point()):
+        floating = [leaf for leaf in leaves if leaf.is_floating_point()]
+        compiling = torch.compiler.is_compiling()  # a graph holds no branch on data
+        if not (compiling or all(_is_finite(leaf) for leaf in floating)):
             raise ValueError("obs must be finite, got NaN or infinity")
         return cls(leaves, scales, spec, batch_ndim)
 
@@ -112,6 +113,7 @@ class States:
         parts = iter(torch.split(delta, self.sizes, -1))
         leaves = zip(self.leaves, self.scales, strict=True)
         shifts = [(x, next(parts).reshape(x.shape), scale) for x, scale in leaves if scale]
+        # the scale of a floating leaf is 1
         return [s.to(x.dtype) if x.is_floating_point() else s.float() * k for x, s, k in shifts]
 
     def unflatten(self, delta: Tensor) -> Any:
@@ -150,7 +152,7 @@ def _scale(dtype: torch.dtype, obs_scale: float | None) -> float | None:
 
 
 def _is_finite(x: Tensor) -> bool:
-    # one NaN or infinity makes the sum such, as may the size of finite numbers
+    # a finite sum, which costs less, has finite terms; of large ones it may overflow
     return math.isfinite(x.detach().sum()) or bool(torch.isfinite(x).all())
 
 

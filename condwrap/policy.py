@@ -127,7 +127,7 @@ def check_reusable(policy: Policy) -> None:
     Dropout by a function, such as `F.dropout`, cannot be seen.
     """
     for module in _modules(policy):
-        rate = vars(module).get("dropout", 0.0)  # of recurrent layers and attention
+        rate = getattr(module, "dropout", 0.0)  # of recurrent layers and attention
         drops = isinstance(rate, float) and rate > 0
         kinds = (_NormBase, nn.modules.dropout._DropoutNd)
         if module.training and (drops or isinstance(module, kinds)):

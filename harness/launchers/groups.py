@@ -15,13 +15,14 @@ Group = list[RunSpec]
 
 
 def make_groups(specs: list[RunSpec], store: Store, jobs: int, plain: bool = False) -> list[Group]:
-    """Runs together, as large as leaves none of `jobs` processes idle; each alone if `plain`.
+    """Runs together, as large as leaves none of `jobs` idle; each alone if `plain` or compiled.
 
     Runs that were interrupted stay with those they were begun with: these are as far as they are.
     """
     together: dict[tuple, list[RunSpec]] = {}
     for spec in specs:
-        alone = plain or not has_population(spec.baseline)
+        compiled = spec.args.get("compile", False)
+        alone = plain or compiled or not has_population(spec.baseline)
         settings = tuple((k, str(v)) for k, v in spec.args.items() if k != "agent")
         partners = tuple(store.partners(spec))
         key = (spec.run_id,) if alone else (spec.algorithm, spec.environment, settings, partners)

@@ -39,7 +39,11 @@ def growth(benchmarks: list[dict]) -> Figure:
         for name, series in groupby(measured, key=lambda b: b["extra_info"]["series"]):
             points = [(b["extra_info"]["x"], height(b)) for b in series]
             i = names.index(name)
-            look = {"color": COLORS[i], "marker": MARKERS[i % len(MARKERS)], "markersize": 4}
+            look = {
+                "color": COLORS[i % len(COLORS)],
+                "marker": MARKERS[i % len(MARKERS)],
+                "markersize": 4,
+            }
             axis.plot(*zip(*points, strict=True), label=name, lw=1.6, **look)
         axis.set_xscale("log", base=2)
         axis.set_xticks(sorted({b["extra_info"]["x"] for b in measured}))

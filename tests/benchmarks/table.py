@@ -35,7 +35,7 @@ def table(content: dict) -> str:
 
 
 def in_table(benchmark: dict) -> bool:
-    """Whether it has a goal or a peer, or at least is not there for the figure alone."""
+    """False for what only the figure of growth shows."""
     info = benchmark["extra_info"]
     return "panel" not in info or "goal" in info or "peer" in info
 

@@ -37,7 +37,7 @@ SETTINGS = [
 ]
 
 
-@pytest.fixture(params=SETTINGS, ids=["mlp", "mlp", "impala", "impala"])
+@pytest.fixture(params=SETTINGS, ids=["mlp-64", "mlp-2048", "impala-64", "impala-2048"])
 def setting(request):
     torch.set_num_threads(1)
     make, batch = request.param

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import matplotlib.pyplot as plt
+
 from tests.benchmarks.figure import growth
 from tests.benchmarks.table import table
 
@@ -55,4 +57,5 @@ def test_the_figure_has_a_panel_for_each_quantity_and_a_line_for_each_series():
     assert (batch.get_xlabel(), jobs.get_xlabel()) == ("batch", "jobs")
     lines = {line.get_label(): line.get_xydata().tolist() for line in batch.lines}
     assert lines == {name: [[1, 500.0], [2, 1000.0], [4, 2000.0]] for name in ("ours", "theirs")}
+    plt.close(figure)
     assert jobs.lines[0].get_xydata().tolist() == [[1, 2000.0], [2, 1000.0], [4, 500.0]]

@@ -68,8 +68,8 @@ def single_iteration(baseline, task, **settings):
         state["obs"] = data.next_obs
         baseline.make_row(args, learner, data, losses, 0.0)
 
-    yield iterate, args.batch_size
-    envs.close()
+    with contextlib.closing(envs):
+        yield iterate, args.batch_size
 
 
 @pytest.mark.parametrize("coefficient", [0.0, 1e-3])
@@ -108,8 +108,8 @@ def population_iteration(algorithm, task, coefficient, agents):
             learner.update += 1
             args.single.make_row(each, learner, *row, 0.0)
 
-    yield iterate, agents * args.batch_size
-    envs.close()
+    with contextlib.closing(envs):
+        yield iterate, agents * args.batch_size
 
 
 @pytest.mark.parametrize("coefficient", [0.0, 1e-3])

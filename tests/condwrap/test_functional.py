@@ -216,6 +216,16 @@ def test_safe_norm_and_its_gradient_at_0(library):
     np.testing.assert_allclose(gradient, [[0.0, 0.0], [0.6, 0.8]], rtol=1e-15)
 
 
+def test_second_derivative_beside_a_state_that_does_not_respond():
+    weight = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
+    output = weight * torch.tensor([[0.5], [0.0]], dtype=torch.float64)
+    quotient = conditioning_quotient(output, torch.zeros_like(output), torch.ones_like(output))
+    # psi = (0.5 w - 1)² + 1: its slope at w = 1 is 0.5 w - 1, and the slope of that 0.5
+    (slope,) = torch.autograd.grad(clamping_penalty(quotient).sum(), weight, create_graph=True)
+    (curvature,) = torch.autograd.grad(slope, weight)
+    assert (slope.item(), curvature.item()) == (-0.5, 0.5)
+
+
 def test_jit_gives_the_same_values_and_gradients():
     inputs = arrays("jax", "float64", OUTPUT, PERTURBED, DELTA)
     np.testing.assert_allclose(jax.jit(conditioning_quotient)(*inputs), QUOTIENT, rtol=1e-14)

@@ -26,8 +26,10 @@ def test_the_agents_of_a_seed_are_trained_together(store):
         assert [run.args["agent"] for run in group] == [0, 1, 2]
 
 
-def test_plain_and_what_has_no_population_are_alone(store):
+def test_plain_and_compiled_and_what_has_no_population_are_alone(store):
     runs = table1(seeds=1, agents=3)
+    compiled = [dataclasses.replace(run, args={**run.args, "compile": True}) for run in runs]
+    assert [len(group) for group in make_groups(compiled, store, 2)] == [1] * 12
     assert [len(group) for group in make_groups(runs, store, 2, plain=True)] == [1] * 12
     coinrun = load_suite("table2").runs
     assert not has_population("ppo_reg_coinrun")
