@@ -31,7 +31,21 @@ def table(content: dict) -> str:
             speed = f"{1 / pace(b):,.0f}" if steps else ""
             name = b["name"].removeprefix("test_") + (" (peer)" if b is peer else "")
             lines.append(f"| {name} | {duration(b)} | {speed} | {ratio} | {goal} |")
+        shares = [line for b in found for line in share_lines(b, found)]
+        lines += ["", *shares] if shares else []
     return "\n".join(lines) + "\n"
+
+
+def share_lines(benchmark: dict, group: list[dict]) -> list[str]:
+    """What share it reaches of the speed of others in its group, beside the goal for that."""
+    lines = []
+    for other in group:
+        goal = benchmark["extra_info"].get("shares", {}).get(other["name"])
+        if goal is not None:
+            share = pace(other) / pace(benchmark)
+            names = [b["name"].removeprefix("test_") for b in (benchmark, other)]
+            lines.append(f"- {names[0]}: {share:.2f} of {names[1]} (goal {goal})")
+    return lines
 
 
 def in_table(benchmark: dict) -> bool:

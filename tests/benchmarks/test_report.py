@@ -36,6 +36,16 @@ def test_ratios_are_of_the_pace_of_a_step():
     assert lines[-1] == "| peer[a] (peer) | 2.00 s | 500 | 1.00 |  |"
 
 
+def test_shares_are_of_the_speed_of_another_in_the_group():
+    lines = table(
+        content(
+            measured("plain[a]", 1.0, "PPO", steps=1000),
+            measured("penalty[a]", 2.5, "PPO", steps=2000, shares={"test_plain[a]": 0.9}),
+        )
+    ).splitlines()
+    assert lines[-1] == "- penalty[a]: 0.80 of plain[a] (goal 0.9)"
+
+
 def test_what_only_the_figure_shows_is_not_in_the_table():
     grown = measured("batch[16]", 1.0, panel="batch", x=16, series="ours")
     lines = table(content(grown, measured("other", 0.5, "alone"))).splitlines()
