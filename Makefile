@@ -27,7 +27,7 @@ check: $(INSTALLED)  ## lint, format, types and the direction of imports
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(INSTALLED)  ## benchmarks beside their peers, as one table; a quarter of an hour
+bench: $(INSTALLED)  ## benchmarks beside their peers, as one table; under half an hour
 	$(BIN)/python -m pip install --quiet --no-deps stable-baselines3==2.9.2 sb3-contrib==2.9.2
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-enable --benchmark-only --quiet -m '' \
 		--benchmark-json=benchmarks.json --benchmark-columns=median
