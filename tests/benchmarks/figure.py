@@ -17,6 +17,7 @@ import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
 from harness.report.figures import COLORS, save, tidy
+from tests.benchmarks.table import pace
 
 MARKERS = "osD^"
 
@@ -60,8 +61,7 @@ def growth(benchmarks: list[dict]) -> Figure:
 
 def height(benchmark: dict) -> float:
     """Steps a second where steps are counted, else milliseconds."""
-    seconds, steps = benchmark["stats"]["median"], benchmark["extra_info"].get("steps")
-    return steps / seconds if steps else 1000 * seconds
+    return 1 / pace(benchmark) if "steps" in benchmark["extra_info"] else 1000 * pace(benchmark)
 
 
 if __name__ == "__main__":
