@@ -692,9 +692,9 @@ def total_loss(
         weights = [p for p in agent.parameters() if p.ndim > 1]
         loss = loss + args.l2 * 0.5 * sum(w.square().sum() for w in weights)
     if batch.delta is not None:  # condwrap
-        answer = None if args.bf16 else logprobs  # condwrap: rounding would pass for sensitivity
+        output = None if args.bf16 else logprobs  # condwrap: rounding would pass for sensitivity
         measured = learner.regularizer(  # condwrap
-            agent.logprobs, batch.obs, delta=batch.delta, answer=answer  # condwrap
+            agent.logprobs, batch.obs, delta=batch.delta, output=output  # condwrap
         )  # condwrap  # fmt: skip
         loss = loss + measured.penalty  # condwrap
     return loss, torch.stack([pg_loss, entropy, kl, clipfrac, value_loss]).detach()

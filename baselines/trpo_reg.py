@@ -460,7 +460,7 @@ def update(args: Args, learner: Learner, data: Rollout) -> dict[str, float]:
         policy = actor(obs)
         surrogate = ((policy.log_prob(actions) - old_logprobs).exp() * advantages).mean()
         if args.coefficient > 0:  # condwrap
-            measured = learner.regularizer(actor, obs, delta=delta, answer=policy)  # condwrap
+            measured = learner.regularizer(actor, obs, delta=delta, output=policy)  # condwrap
             surrogate = surrogate - measured.penalty  # condwrap
         return surrogate
 

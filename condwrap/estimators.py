@@ -47,7 +47,7 @@ def jvp(
 ) -> tuple[Tensor, Tensor]:
     """Jacobian · delta by forward-mode differentiation, and 0: the difference in the limit."""
     if known is not None:
-        raise ValueError("answer is of use to estimator='difference' only")
+        raise ValueError("output is of use to estimator='difference' only")
     try:
         with untouched(policy, states.device):
             change = torch.func.jvp(

@@ -1,4 +1,4 @@
-"""Evaluate a policy without leaving a trace in it, and choose the tensor that its answer means.
+"""Evaluate a policy without leaving a trace in it, and choose the tensor that its output means.
 
 Any callable is a policy. Running it a second time on perturbed observations must change nothing
 that training depends on, nor must its own randomness or its batch statistics count as sensitivity.
@@ -18,49 +18,50 @@ from torch import distributions as td
 from torch.nn.modules.batchnorm import _NormBase
 
 Policy = Callable[[Any], Any]  # obs -> Tensor | Distribution | tuple, list or dict of them
-Output = str | Callable[[Any], Any]
+Select = str | Callable[[Any], Any]
 
-OUTPUTS = ("default", "mean", "logits", "probs")
+SELECTIONS = ("default", "mean", "logits", "probs")
 _MEAN = (td.Normal, td.MultivariateNormal, td.LowRankMultivariateNormal)
 _LOGITS = (td.Categorical, td.OneHotCategorical, td.Bernoulli)
 
 
-def check_output(output: Output) -> None:
-    """Raise unless `output` is a known name or a callable."""
-    if not (isinstance(output, str) or callable(output)):
-        raise TypeError(f"output must be a name or a callable, got {type(output).__name__}")
-    if isinstance(output, str) and output not in OUTPUTS:
+def check_select(select: Select) -> None:
+    """Raise unless `select` is a known name or a callable."""
+    if not (isinstance(select, str) or callable(select)):
+        raise TypeError(f"select must be a name or a callable, got {type(select).__name__}")
+    if isinstance(select, str) and select not in SELECTIONS:
         raise ValueError(
-            f"output must be one of {list(OUTPUTS)} or a callable answer -> tensor, got {output!r}"
+            f"select must be one of {list(SELECTIONS)} or a callable output -> tensor, "
+            f"got {select!r}"
         )
 
 
-def flat_output(answer: Any, output: Output, batch: torch.Size, known: bool = False) -> Tensor:
-    """The policy's answer as one floating tensor `[*batch, m]`.
+def flat_output(output: Any, select: Select, batch: torch.Size, known: bool = False) -> Tensor:
+    """The policy's output as one floating tensor `[*batch, m]`.
 
     Args:
-        answer: What the policy returned; the members of a tuple, list or dict are joined.
-        output: "default" takes a tensor as it is, the mean of a Gaussian and the logits of a
+        output: What the policy returned; the members of a tuple, list or dict are joined.
+        select: "default" takes a tensor as it is, the mean of a Gaussian and the logits of a
             Categorical (normalized by PyTorch, so they are log-probabilities), OneHotCategorical
             or Bernoulli. "mean", "logits" and "probs" ask for that attribute of a distribution. A
-            callable picks from the answer; what it returns is read as "default" does.
+            callable picks from the output; what it returns is read as "default" does.
         batch: The leading axes that every tensor must have.
-        known: The answer was computed elsewhere, so perhaps under autocast.
+        known: The output was computed elsewhere, so perhaps under autocast.
 
     Raises:
-        TypeError: An answer that cannot be read, or an integer tensor.
-        ValueError: The selector returned nothing, a tensor lost the batch axes, or a known answer
+        TypeError: An output that cannot be read, or an integer tensor.
+        ValueError: The selector returned nothing, a tensor lost the batch axes, or a known output
             is in half precision.
     """
-    if callable(output):
-        answer = output(answer)
-        if answer is None:
-            raise ValueError("the output selector returned None: it must return a tensor")
-        output = "default"
-    tensors = list(_tensors(answer, output))
+    if callable(select):
+        output = select(output)
+        if output is None:
+            raise ValueError("select returned None: it must return a tensor")
+        select = "default"
+    tensors = list(_tensors(output, select))
     if not tensors:
         raise ValueError(
-            f"the policy's answer holds no tensor: got an empty {type(answer).__name__}"
+            f"the policy's output holds no tensor: got an empty {type(output).__name__}"
         )
     for x in tensors:
         if x.shape[: len(batch)] != batch:
@@ -75,8 +76,8 @@ def flat_output(answer: Any, output: Output, batch: torch.Size, known: bool = Fa
             )
         if known and x.dtype in (torch.bfloat16, torch.float16):
             raise ValueError(
-                f"answer must be float32 at least, got {x.dtype}, whose rounding would pass for "
-                "sensitivity: leave answer out"
+                f"output must be float32 at least, got {x.dtype}, whose rounding would pass for "
+                "sensitivity: leave output out"
             )
     # bf16 and fp16 differences would lose J to rounding
     wide = (x if x.dtype == torch.float64 else x.float() for x in tensors)
@@ -85,44 +86,44 @@ def flat_output(answer: Any, output: Output, batch: torch.Size, known: bool = Fa
     )
 
 
-def _tensors(answer: Any, output: str) -> Iterator[Tensor]:
-    if isinstance(answer, Tensor):
-        yield answer
-    elif isinstance(answer, td.Distribution):
-        yield _parameter(answer, output)
-    elif isinstance(answer, Mapping):
-        for value in answer.values():
-            yield from _tensors(value, output)
-    elif isinstance(answer, tuple | list):
-        for value in answer:
-            yield from _tensors(value, output)
+def _tensors(output: Any, select: str) -> Iterator[Tensor]:
+    if isinstance(output, Tensor):
+        yield output
+    elif isinstance(output, td.Distribution):
+        yield _parameter(output, select)
+    elif isinstance(output, Mapping):
+        for value in output.values():
+            yield from _tensors(value, select)
+    elif isinstance(output, tuple | list):
+        for value in output:
+            yield from _tensors(value, select)
     else:
         raise TypeError(
             "a policy must return a Tensor, a Distribution, or a tuple, list or dict of these, got "
-            f"{type(answer).__name__}: pass output=lambda answer: ... to select the tensor"
+            f"{type(output).__name__}: pass select=lambda output: ... to select the tensor"
         )
 
 
-def _parameter(distribution: td.Distribution, output: str) -> Tensor:
+def _parameter(distribution: td.Distribution, select: str) -> Tensor:
     base = distribution.base_dist if isinstance(distribution, td.Independent) else distribution
-    if output == "default":
-        output = (
+    if select == "default":
+        select = (
             "mean" if isinstance(base, _MEAN) else "logits" if isinstance(base, _LOGITS) else ""
         )
     try:
-        value = getattr(base, output, None) if output else None
+        value = getattr(base, select, None) if select else None
     except NotImplementedError:  # a mean that has no closed form
         value = None
-    if value is None or (output == "mean" and isinstance(base, td.Categorical)):  # that is NaN
+    if value is None or (select == "mean" and isinstance(base, td.Categorical)):  # that is NaN
         raise TypeError(
-            f"no {output or 'default output'} for {type(base).__name__}: "
-            "pass output=lambda answer: ... to select the tensor"
+            f"no {select or 'default output'} for {type(base).__name__}: "
+            "pass select=lambda output: ... to select the tensor"
         )
     return value  # type: ignore[no-any-return]
 
 
 def check_reusable(policy: Policy) -> None:
-    """Raise if a module would answer otherwise in `untouched`: dropout and batch norm in training.
+    """Raise if `untouched` would change the output: dropout or batch norm in training mode.
 
     Dropout by a function, such as `F.dropout`, cannot be seen.
     """
@@ -132,8 +133,8 @@ def check_reusable(policy: Policy) -> None:
         kinds = (_NormBase, nn.modules.dropout._DropoutNd)
         if module.training and (drops or isinstance(module, kinds)):
             raise ValueError(
-                f"answer cannot be used with {type(module).__name__} in training mode, which would "
-                "count as sensitivity: leave answer out"
+                f"output cannot be used with {type(module).__name__} in training mode, which would "
+                "count as sensitivity: leave output out"
             )
 
 

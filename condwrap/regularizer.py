@@ -13,14 +13,14 @@ from condwrap.estimators import ESTIMATORS
 from condwrap.functional import check_range, clamping_penalty, conditioning_quotient
 from condwrap.observation import States
 from condwrap.perturbation import Perturbation, get_perturbation
-from condwrap.policy import Output, Policy, check_output, check_reusable, flat_output
+from condwrap.policy import Policy, Select, check_reusable, check_select, flat_output
 
 
 @dataclasses.dataclass(frozen=True)
 class Conditioning:
     """What a `ConditioningRegularizer` returns; B is the number of states it was estimated on.
 
-    With `quotient="batch"` psi and quotient have shape `[]`.
+    With `reduction="batch"` psi and quotient have shape `[]`.
 
     Example:
         >>> import torch
@@ -40,6 +40,35 @@ class Conditioning:
     fraction_above: Tensor
     """Share of the states with J > lambda_max, `[]`, in [0, 1]."""
 
+    def metrics(self, prefix: str = "conditioning/") -> dict[str, float]:
+        """The numbers to log, as Python floats under names that begin with `prefix`.
+
+        `psi` is the mean of psi, `quotient_q05`, `_q50` and `_q95` are quantiles of J,
+        `quotient_squared` is the mean of J², beside `fraction_below` and `fraction_above`.
+
+        Example:
+            >>> import torch
+            >>> policy = torch.nn.Linear(1, 1, bias=False)
+            >>> policy.weight.data = torch.tensor([[0.5]])
+            >>> metrics = ConditioningRegularizer()(policy, torch.ones(8, 1)).metrics()
+            >>> metrics["conditioning/psi"], metrics["conditioning/quotient_q50"]
+            (0.25, 0.5)
+        """
+        quotient = self.quotient.flatten()
+        levels = torch.tensor([0.05, 0.5, 0.95], dtype=quotient.dtype, device=quotient.device)
+        q05, q50, q95 = quotient.quantile(levels)
+        tensors = {
+            "psi": self.psi.mean(),
+            "quotient_q05": q05,
+            "quotient_q50": q50,
+            "quotient_q95": q95,
+            "quotient_squared": quotient.square().mean(),
+            "fraction_below": self.fraction_below,
+            "fraction_above": self.fraction_above,
+        }
+        numbers = torch.stack([x.to(quotient.dtype) for x in tensors.values()]).tolist()
+        return {f"{prefix}{name}": x for name, x in zip(tensors, numbers, strict=True)}
+
 
 class ConditioningRegularizer:
     """Penalty on the conditioning of a policy: coefficient · mean(psi), equations (1) to (3).
@@ -57,18 +86,21 @@ class ConditioningRegularizer:
         coefficient: c1, at least 0.
         lambda_min: Lower end of the range, at least 0.
         lambda_max: Upper end of the range, at least `lambda_min`.
-        quotient: "sample", one J for each state, or "batch", one J for the whole batch.
+        reduction: "sample", one J for each state, or "batch", one J for the whole batch.
         perturbation: "sphere", "gaussian" or "uniform" (see `condwrap.perturbation`), or a map
             from standard-normal noise `[..., n]` to delta.
-        radius: Size of a named perturbation, above 0, in units of the policy's observation.
-        output: Which tensor of the answer is pi(S): "default" (a tensor as it is, the mean of a
+        radius: Root-mean-square length of a named perturbation, above 0, in units of the policy's
+            observation.
+        select: Which tensor of the output is pi(S): "default" (a tensor as it is, the mean of a
             Gaussian, the normalized logits of a Categorical or Bernoulli; all members of a tuple
-            or dict, joined), "mean", "logits", "probs", or a callable answer -> tensor.
+            or dict, joined), "mean", "logits", "probs", or a callable output -> tensor.
         fraction: Share of the states to estimate on, in (0, 1]: evenly spaced, at least one.
         estimator: "difference" (the paper) or "jvp", the limit of a vanishing delta.
         obs_scale: What the policy divides integer observations by; delta then has the units of
             the quotient. By default 255 for uint8, and other integers are refused.
         batch_ndim: Number of leading axes that index states.
+        printed_sign: Negate the penalty, which then rewards bad conditioning: equation (3) as it
+            is printed. For experiments on the erratum alone.
         seed: Of the regularizer's own generator, on the CPU.
         generator: A generator to use instead, such as one on the GPU, where noise is then drawn.
 
@@ -89,23 +121,24 @@ class ConditioningRegularizer:
         lambda_min: float = 1.0,
         lambda_max: float = 20.0,
         *,
-        quotient: str = "sample",
+        reduction: str = "sample",
         perturbation: str | Perturbation = "sphere",
         radius: float = 1.0,
-        output: Output = "default",
+        select: Select = "default",
         fraction: float = 1.0,
         estimator: str = "difference",
         obs_scale: float | None = None,
         batch_ndim: int = 1,
+        printed_sign: bool = False,
         seed: int = 0,
         generator: torch.Generator | None = None,
     ) -> None:
         if not (coefficient >= 0 and math.isfinite(coefficient)):
             raise ValueError(f"coefficient must be finite and at least 0, got {coefficient}")
         check_range(lambda_min, lambda_max)
-        if quotient not in ("sample", "batch"):
-            raise ValueError(f"quotient must be 'sample' or 'batch', got {quotient!r}")
-        check_output(output)
+        if reduction not in ("sample", "batch"):
+            raise ValueError(f"reduction must be 'sample' or 'batch', got {reduction!r}")
+        check_select(select)
         if not 0 < fraction <= 1:
             raise ValueError(f"fraction must be in (0, 1], got {fraction}")
         if estimator not in ESTIMATORS:
@@ -117,17 +150,18 @@ class ConditioningRegularizer:
         self.coefficient = coefficient
         self.lambda_min = lambda_min
         self.lambda_max = lambda_max
-        self.quotient = quotient
+        self.reduction = reduction
         self.perturbation = get_perturbation(perturbation, radius)
-        self.output = output
+        self.select = select
         self.fraction = fraction
         self.estimator = estimator
         self.obs_scale = obs_scale
         self.batch_ndim = batch_ndim
+        self.printed_sign = printed_sign
         self.generator = generator or torch.Generator().manual_seed(seed)
 
     def __call__(
-        self, policy: Policy, obs: Any, *, delta: Any = None, answer: Any = None
+        self, policy: Policy, obs: Any, *, delta: Any = None, output: Any = None
     ) -> Conditioning:
         """Measure the policy's conditioning on a batch of observations.
 
@@ -137,22 +171,22 @@ class ConditioningRegularizer:
             obs: `[*batch, *obs_shape]`, floating or uint8, or a dict of these. In float32 at least:
                 bf16 would round S + delta.
             delta: A perturbation from `sample_delta` to use instead of drawing one.
-            answer: `policy(obs)`, where the loss has computed it anyway: a third of the work less.
+            output: `policy(obs)`, where the loss has computed it anyway: a third of the work less.
                 In float32 at least, and of a policy without dropout, whose masks would differ.
 
         Raises:
-            TypeError: An observation or answer of a kind or dtype that cannot be used.
+            TypeError: An observation or output of a kind or dtype that cannot be used.
             ValueError: Empty or (outside compiled code) non-finite observations, a delta that
                 does not match, an output that lost the batch axes or has no gradient.
         """
         given = States.read(obs, self.obs_scale, self.batch_ndim)
         states = given.subset(self.fraction)
         flat_delta = self._draw(states) if delta is None else states.flatten(delta)
-        known = None if answer is None else self._known(policy, answer, given)
+        known = None if output is None else self._known(policy, output, given)
         learns = self.coefficient > 0 and torch.is_grad_enabled()
 
         def respond(states_obs: Any) -> Tensor:
-            return flat_output(policy(states_obs), self.output, states.batch)
+            return flat_output(policy(states_obs), self.select, states.batch)
 
         with (
             torch.set_grad_enabled(learns),
@@ -164,11 +198,12 @@ class ConditioningRegularizer:
                     "the policy's output has no gradient: check that its parameters require one "
                     "and that it does not detach, or set coefficient=0 to only measure"
                 )
-            batch_ndim = self.batch_ndim if self.quotient == "sample" else 0
+            batch_ndim = self.batch_ndim if self.reduction == "sample" else 0
             quotient = conditioning_quotient(*outputs, flat_delta, batch_ndim=batch_ndim)
             psi = clamping_penalty(quotient, self.lambda_min, self.lambda_max)
+            factor = -self.coefficient if self.printed_sign else self.coefficient
             # 0 · infinity is NaN, so a coefficient of 0 does not multiply
-            penalty = self.coefficient * psi.mean() if self.coefficient else psi.new_zeros(())
+            penalty = factor * psi.mean() if factor else psi.new_zeros(())
         quotient = quotient.detach()
         return Conditioning(
             penalty=penalty,
@@ -200,9 +235,9 @@ class ConditioningRegularizer:
         """Restore what `state_dict` returned."""
         self.generator.set_state(state_dict["generator"].cpu())
 
-    def _known(self, policy: Policy, answer: Any, states: States) -> Tensor:
+    def _known(self, policy: Policy, output: Any, states: States) -> Tensor:
         check_reusable(policy)
-        output = flat_output(answer, self.output, states.batch, known=True)
+        output = flat_output(output, self.select, states.batch, known=True)
         return dataclasses.replace(states, leaves=[output]).subset(self.fraction).leaves[0]
 
     def _draw(self, states: States) -> Tensor:

@@ -18,11 +18,11 @@ from torch.func import jvp, vmap
 
 from condwrap.functional import safe_norm
 from condwrap.jacobian import jacobians, pullback, read_states, response, zero_delta
-from condwrap.policy import Output, Policy
+from condwrap.policy import Policy, Select
 
 
 def jacobian_singular_values(
-    policy: Policy, obs: Any, *, output: Output = "default", chunk_size: int | None = None
+    policy: Policy, obs: Any, *, select: Select = "default", chunk_size: int | None = None
 ) -> Tensor:
     """All singular values of each state's Jacobian, largest first, `[B, min(m, n)]`.
 
@@ -34,7 +34,7 @@ def jacobian_singular_values(
     Args:
         policy: Any callable obs -> tensor, distribution, or tuple or dict of them.
         obs: `[B, *obs_shape]`, floating or uint8 (in units of 255), or a dict of these.
-        output: Which tensor of the policy's answer counts.
+        select: Which tensor of the policy's output counts.
         chunk_size: States whose Jacobians are held at a time, at least 1; by default all.
 
     Raises:
@@ -46,12 +46,12 @@ def jacobian_singular_values(
         >>> jacobian_singular_values(policy, torch.ones(1, 3)).tolist()
         [[3.0, 2.0]]
     """
-    parts = _jacobians(policy, obs, output, chunk_size)
+    parts = _jacobians(policy, obs, select, chunk_size)
     return torch.cat(list(map(_singular_values, parts)))  # a loop's name would hold a second chunk
 
 
 def condition_number(
-    policy: Policy, obs: Any, *, output: Output = "default", chunk_size: int | None = None
+    policy: Policy, obs: Any, *, select: Select = "default", chunk_size: int | None = None
 ) -> Tensor:
     """Largest over smallest singular value of each state's Jacobian, `[B]`, in [1, infinity].
 
@@ -64,13 +64,13 @@ def condition_number(
         >>> condition_number(policy, torch.ones(1, 3)).tolist()
         [1.5]
     """
-    values = jacobian_singular_values(policy, obs, output=output, chunk_size=chunk_size)
+    values = jacobian_singular_values(policy, obs, select=select, chunk_size=chunk_size)
     zero = values[:, -1] == 0
     return (values[:, 0] / values[:, -1].masked_fill(zero, 1.0)).masked_fill(zero, torch.inf)
 
 
 def mean_squared_singular_value(
-    policy: Policy, obs: Any, *, output: Output = "default", chunk_size: int | None = None
+    policy: Policy, obs: Any, *, select: Select = "default", chunk_size: int | None = None
 ) -> Tensor:
     """Mean squared singular value of each state's Jacobian, `[B]`: ‖Jacobian‖_F² / min(m, n).
 
@@ -83,7 +83,7 @@ def mean_squared_singular_value(
         >>> mean_squared_singular_value(policy, torch.ones(1, 3)).tolist()
         [6.5]
     """
-    parts = _jacobians(policy, obs, output, chunk_size)
+    parts = _jacobians(policy, obs, select, chunk_size)
     return torch.cat(list(map(_mean_square, parts)))
 
 
@@ -92,7 +92,7 @@ def largest_singular_value(
     obs: Any,
     *,
     iterations: int = 20,
-    output: Output = "default",
+    select: Select = "default",
     generator: torch.Generator | None = None,
 ) -> Tensor:
     """Largest singular value of each state's Jacobian by power iteration, `[B]`, from below.
@@ -105,7 +105,7 @@ def largest_singular_value(
         policy: As for `jacobian_singular_values`; its operations need a forward mode.
         obs: As for `jacobian_singular_values`.
         iterations: Power iterations, at least 1.
-        output: Which tensor of the policy's answer counts.
+        select: Which tensor of the policy's output counts.
         generator: Draws the first v; by default a new one of seed 0.
 
     Raises:
@@ -118,11 +118,11 @@ def largest_singular_value(
         3.0
     """
     _at_least_1("iterations", iterations)
-    states = read_states(obs, output)
-    respond, at = response(policy, states, output), zero_delta(states)
+    states = read_states(obs, select)
+    respond, at = response(policy, states, select), zero_delta(states)
     v = _normalize(_noise(at.shape, at, generator))
     with torch.no_grad():
-        _, product = pullback(policy, states, output)
+        _, product = pullback(policy, states, select)
         for _ in range(iterations):
             change = jvp(respond, (at,), (v,))[1]
             v = _normalize(product(_normalize(change)))  # sigma⁴ would leave the range of float32
@@ -135,7 +135,7 @@ def squared_frobenius_norm(
     obs: Any,
     *,
     probes: int = 1,
-    output: Output = "default",
+    select: Select = "default",
     generator: torch.Generator | None = None,
 ) -> Tensor:
     """Unbiased estimate of ‖Jacobian‖_F² of each state, `[B]`: the mean of ‖Jᵀ w‖² (Hutchinson).
@@ -147,7 +147,7 @@ def squared_frobenius_norm(
         policy: As for `jacobian_singular_values`.
         obs: As for `jacobian_singular_values`.
         probes: Number of w, at least 1; the estimate's standard deviation falls as 1/√probes.
-        output: Which tensor of the policy's answer counts.
+        select: Which tensor of the policy's output counts.
         generator: Draws w; by default a new one of seed 0.
 
     Raises:
@@ -160,20 +160,20 @@ def squared_frobenius_norm(
         13.0
     """
     _at_least_1("probes", probes)
-    states = read_states(obs, output)
-    answer, product = pullback(policy, states, output)
-    w = _noise((probes, *answer.shape), answer, generator).sign()
+    states = read_states(obs, select)
+    output, product = pullback(policy, states, select)
+    w = _noise((probes, *output.shape), output, generator).sign()
     products: Tensor = vmap(product)(w)
     return products.square().sum(-1).mean(0)
 
 
 def _jacobians(
-    policy: Policy, obs: Any, output: Output, chunk_size: int | None
+    policy: Policy, obs: Any, select: Select, chunk_size: int | None
 ) -> Iterator[Tensor]:
-    states = read_states(obs, output)
+    states = read_states(obs, select)
     if chunk_size is not None:
         _at_least_1("chunk_size", chunk_size)
-    return jacobians(policy, states, output, chunk_size or states.batch[0])
+    return jacobians(policy, states, select, chunk_size or states.batch[0])
 
 
 def _mean_square(jacobian: Tensor) -> Tensor:

@@ -349,9 +349,9 @@ class Spy:
         self.drawn.append(self.regularizer.sample_delta(obs))
         return self.drawn[-1].clone()
 
-    def __call__(self, policy, obs, *, delta, answer):
+    def __call__(self, policy, obs, *, delta, output):
         self.calls.append((obs.clone(), delta.clone()))
-        return self.regularizer(policy, obs, delta=delta, answer=answer)
+        return self.regularizer(policy, obs, delta=delta, output=output)
 
 
 def collected(**changes):

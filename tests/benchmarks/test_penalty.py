@@ -65,7 +65,7 @@ def quarter(policy, obs, output, regularizer=ConditioningRegularizer(fraction=0.
 
 
 def with_answer(policy, obs, output, regularizer=ConditioningRegularizer()):  # noqa: B008
-    return regularizer(policy, obs, answer=output).penalty
+    return regularizer(policy, obs, output=output).penalty
 
 
 def jacobian_regularization(policy, obs, output):

@@ -19,9 +19,9 @@ pytestmark = pytest.mark.filterwarnings(
 )
 
 
-def jacobian(policy, obs, output="default", chunk_size=100):
-    states = read_states(obs, output)
-    return torch.cat(list(jacobians(policy, states, output, chunk_size)))
+def jacobian(policy, obs, select="default", chunk_size=100):
+    states = read_states(obs, select)
+    return torch.cat(list(jacobians(policy, states, select, chunk_size)))
 
 
 class Recurrent(nn.Module):
@@ -77,9 +77,9 @@ def test_a_jacobian_worked_out_by_hand(dtype):
     assert got.tolist() == expected
 
 
-@pytest.mark.parametrize("answer", [lambda x: torch.ones(len(x), 2), lambda x: 0 * x[:, :2]])
-def test_a_constant_has_a_jacobian_of_0(answer):
-    got = jacobian(answer, torch.randn(3, 4))
+@pytest.mark.parametrize("output", [lambda x: torch.ones(len(x), 2), lambda x: 0 * x[:, :2]])
+def test_a_constant_has_a_jacobian_of_0(output):
+    got = jacobian(output, torch.randn(3, 4))
     assert got.shape == (3, 2, 4)
     assert got.eq(0).all()
 
@@ -147,19 +147,19 @@ def test_uint8_images_are_measured_in_the_units_after_division():
 
 
 @pytest.mark.parametrize(
-    ("answer", "tensor", "output"),
+    ("output", "tensor", "select"),
     [
         (lambda x: td.Normal(x, 1.0), lambda x: x, "default"),
         (lambda x: td.Independent(td.Normal(x, 1.0), 1), lambda x: x, "mean"),
         (lambda x: td.Categorical(logits=x), lambda x: x.log_softmax(-1), "default"),
         (lambda x: td.Categorical(logits=x), lambda x: x.softmax(-1), "probs"),
         (lambda x: (td.Normal(x, 1.0), 2 * x), lambda x: torch.cat([x, 2 * x], -1), "default"),
-        (lambda x: {"pi": x, "v": x[:, 0]}, lambda x: x[:, :1], lambda answer: answer["v"]),
+        (lambda x: {"pi": x, "v": x[:, 0]}, lambda x: x[:, :1], lambda output: output["v"]),
     ],
 )
-def test_rows_are_the_outputs_that_count(answer, tensor, output):
+def test_rows_are_the_outputs_that_count(output, tensor, select):
     net, obs = mlp(), torch.randn(4, 4)
-    got = jacobian(lambda x: answer(net(x)), obs, output)
+    got = jacobian(lambda x: output(net(x)), obs, select)
     torch.testing.assert_close(got, jacobian(lambda x: tensor(net(x)), obs))
 
 
@@ -246,20 +246,20 @@ def test_batch_norm_in_training_runs_on_its_statistics_and_keeps_them():
 
 
 @pytest.mark.parametrize(
-    ("obs", "output", "error", "message"),
+    ("obs", "select", "error", "message"),
     [
         (torch.ones(3, 4).long(), "default", TypeError, "obs must be floating or uint8"),
         (torch.ones(0, 4), "default", ValueError, "obs must not be empty, got shapes [(0, 4)]"),
         (torch.ones(3, 4) * math.nan, "default", ValueError, "obs must be finite, got NaN"),
         (torch.ones(()), "default", ValueError, "obs needs batch_ndim=1 leading axes"),
         (np.ones((3, 4)), "default", TypeError, "must be a Tensor or a dict of Tensors"),
-        (torch.ones(3, 4), "variance", ValueError, "output must be one of"),
-        (torch.ones(3, 4), None, TypeError, "output must be a name or a callable, got NoneType"),
+        (torch.ones(3, 4), "variance", ValueError, "select must be one of"),
+        (torch.ones(3, 4), None, TypeError, "select must be a name or a callable, got NoneType"),
     ],
 )
-def test_what_cannot_be_read_is_refused(obs, output, error, message):
+def test_what_cannot_be_read_is_refused(obs, select, error, message):
     with pytest.raises(error, match=re.escape(message)):
-        read_states(obs, output)
+        read_states(obs, select)
 
 
 @pytest.mark.parametrize(
@@ -270,6 +270,6 @@ def test_what_cannot_be_read_is_refused(obs, output, error, message):
         (lambda x: td.Gamma(x.exp(), 1.0), TypeError, "no default output for Gamma"),
     ],
 )
-def test_an_answer_is_refused(policy, error, message):
+def test_an_output_is_refused(policy, error, message):
     with pytest.raises(error, match=re.escape(message)):
         jacobian(policy, torch.ones(3, 4))

@@ -27,11 +27,15 @@ def noise(*shape, dtype=np.float64):
     ("name", "expected"),
     [
         ("sphere", [[1.2, 1.6], [0.0, -2.0]]),
-        ("gaussian", [[6.0, 8.0], [0.0, -4.0]]),
-        # erf(z / √2) is the share of a normal sample within z standard deviations
+        # 2 / √2 · noise
+        ("gaussian", [[4.242640687119285, 5.656854249492381], [0.0, -2.8284271247461903]]),
+        # 2 · √(3/2) = √6; erf(z / √2) is the share of a normal sample within z deviations
         (
             "uniform",
-            [[2 * 0.9973002039367398, 2 * 0.9999366575163338], [0.0, -2 * 0.9544997361036416]],
+            [
+                [6**0.5 * 0.9973002039367398, 6**0.5 * 0.9999366575163338],
+                [0.0, -(6**0.5) * 0.9544997361036416],
+            ],
         ),
     ],
 )
@@ -54,8 +58,8 @@ def test_sphere_keeps_the_direction_of_the_noise():
     np.testing.assert_allclose(cosine, np.ones(20))
 
 
-def test_uniform_is_within_radius():
-    delta = uniform(noise(1000, 3), radius=0.5)
+def test_uniform_is_within_its_half_width():
+    delta = uniform(noise(1000, 3), radius=0.5)  # three coordinates: the half-width is 0.5 too
     assert (np.abs(delta) < 0.5).all()
     assert np.abs(delta).max() > 0.49
 
@@ -65,7 +69,7 @@ def test_uniform_is_within_radius():
     [
         # a coordinate of a point on the 2-sphere is uniform (Archimedes)
         ("sphere", stats.uniform(-2, 4)),
-        ("gaussian", stats.norm(0, 2)),
+        ("gaussian", stats.norm(0, 2 / 3**0.5)),
         ("uniform", stats.uniform(-2, 4)),
     ],
 )
@@ -75,8 +79,11 @@ def test_coordinates_follow_their_distribution(name, distribution):
         assert stats.kstest(coordinates[:, axis], distribution.cdf).pvalue > 0.01
 
 
-def test_gaussian_has_standard_deviation_radius():
-    assert gaussian(noise(20_000), radius=3.0).std() == pytest.approx(3.0, rel=0.02)
+@every_map
+@pytest.mark.parametrize("n", [1, 3, 40])
+def test_the_mean_squared_length_is_the_squared_radius(name, n):
+    delta = MAPS[name](noise(40_000, n), radius=3.0)
+    assert np.square(delta).sum(-1).mean() == pytest.approx(9.0, rel=0.03)
 
 
 @every_map

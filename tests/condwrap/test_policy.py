@@ -1,4 +1,4 @@
-"""Which tensor an answer means, and that evaluating a policy leaves no trace in it."""
+"""Which tensor an output means, and that evaluating a policy leaves no trace in it."""
 
 import functools
 import re
@@ -9,7 +9,7 @@ from torch import distributions as td
 from torch import nn
 from torch.nn.utils import parametrizations
 
-from condwrap.policy import check_output, flat_output, untouched
+from condwrap.policy import check_select, flat_output, untouched
 
 BATCH = torch.Size([4])
 CPU = torch.device("cpu")
@@ -36,12 +36,12 @@ DEFAULTS = {
 
 @pytest.mark.parametrize("name", DEFAULTS)
 def test_default_output(name):
-    answer, expected = DEFAULTS[name]
-    torch.testing.assert_close(flat_output(answer, "default", BATCH), expected)
+    output, expected = DEFAULTS[name]
+    torch.testing.assert_close(flat_output(output, "default", BATCH), expected)
 
 
 @pytest.mark.parametrize(
-    ("answer", "output", "expected"),
+    ("output", "select", "expected"),
     [
         (td.Normal(X, 2.0), "mean", X),
         (td.Beta(X.exp(), X.exp()), "mean", torch.full((4, 3), 0.5)),
@@ -51,13 +51,13 @@ def test_default_output(name):
         (td.Categorical(logits=X), "probs", X.softmax(-1)),
         (td.Bernoulli(logits=X), "probs", X.sigmoid()),
         ((td.Categorical(logits=X), X), "probs", torch.cat([X.softmax(-1), X], -1)),
-        (td.Normal(X, X.exp()), lambda answer: answer.stddev, X.exp()),
-        (("logged", X, "too"), lambda answer: answer[1], X),
-        ((X, td.Normal(X, 1.0)), lambda answer: answer[1], X),
+        (td.Normal(X, X.exp()), lambda output: output.stddev, X.exp()),
+        (("logged", X, "too"), lambda output: output[1], X),
+        ((X, td.Normal(X, 1.0)), lambda output: output[1], X),
     ],
 )
-def test_chosen_output(answer, output, expected):
-    torch.testing.assert_close(flat_output(answer, output, BATCH), expected)
+def test_chosen_output(output, select, expected):
+    torch.testing.assert_close(flat_output(output, select, BATCH), expected)
 
 
 @pytest.mark.parametrize(
@@ -82,19 +82,19 @@ class Unreadable:
 
 
 @pytest.mark.parametrize(
-    ("answer", "output", "error", "message"),
+    ("output", "select", "error", "message"),
     [
-        (X, lambda answer: None, ValueError, "the output selector returned None"),
-        ((), "default", ValueError, "the policy's answer holds no tensor: got an empty tuple"),
+        (X, lambda output: None, ValueError, "select returned None"),
+        ((), "default", ValueError, "the policy's output holds no tensor: got an empty tuple"),
         ({}, "default", ValueError, "got an empty dict"),
-        (X, lambda answer: [], ValueError, "got an empty list"),
+        (X, lambda output: [], ValueError, "got an empty list"),
         (X.sum(), "default", ValueError, "must begin with the batch axes (4,)"),
         (X.mean(0), "default", ValueError, "got shape (3,)"),
         ((X, X[:2]), "default", ValueError, "got shape (2, 3)"),
         (td.Normal(torch.zeros(3), 1.0), "default", ValueError, "got shape (3,)"),
         (X.argmax(-1), "default", TypeError, "must be floating, got torch.int64"),
         (X.argmax(-1), "default", TypeError, "not the sampled action"),
-        (Unreadable(), "default", TypeError, "got Unreadable: pass output=lambda answer: ..."),
+        (Unreadable(), "default", TypeError, "got Unreadable: pass select=lambda output: ..."),
         ((X, None), "default", TypeError, "got NoneType"),
         (td.Beta(X.exp(), 1.0), "default", TypeError, "no default output for Beta"),
         (td.Normal(X, 1.0), "logits", TypeError, "no logits for Normal"),
@@ -108,18 +108,18 @@ class Unreadable:
         ),
     ],
 )
-def test_an_answer_is_refused(answer, output, error, message):
+def test_an_output_is_refused(output, select, error, message):
     with pytest.raises(error, match=re.escape(message)):
-        flat_output(answer, output, BATCH)
+        flat_output(output, select, BATCH)
 
 
 def test_output_must_be_a_known_name_or_callable():
-    for known in ("default", "mean", "logits", "probs", lambda answer: answer):
-        check_output(known)
+    for known in ("default", "mean", "logits", "probs", lambda output: output):
+        check_select(known)
     with pytest.raises(ValueError, match=re.escape("['default', 'mean', 'logits', 'probs'] or a")):
-        check_output("variance")
-    with pytest.raises(TypeError, match="output must be a name or a callable, got int"):
-        check_output(0)
+        check_select("variance")
+    with pytest.raises(TypeError, match="select must be a name or a callable, got int"):
+        check_select(0)
 
 
 class Agent:

@@ -69,7 +69,7 @@ def test_every_state_has_its_quotient():
 
 
 def test_quotient_batch_gives_one_value_for_the_batch():
-    regularizer = ConditioningRegularizer(coefficient=1.0, quotient="batch")
+    regularizer = ConditioningRegularizer(coefficient=1.0, reduction="batch")
     conditioning = regularizer(linear(DIAGONAL), torch.ones(2, 2), delta=DELTA[:2])
     # changes 60 and 1 over deltas 2 and 2
     expected = math.sqrt((60**2 + 1) / 8)
@@ -199,7 +199,7 @@ def test_training_with_coefficient_0_is_bit_identical_to_training_without():
 
 # --- policies and observations ----------------------------------------------------------------
 
-ANSWERS = {
+OUTPUTS = {
     "Normal": (lambda x: td.Normal(x, 1.0), lambda x: x),
     "Independent": (lambda x: td.Independent(td.Normal(x, 1.0), 1), lambda x: x),
     "MultivariateNormal": (lambda x: td.MultivariateNormal(x, torch.eye(3)), lambda x: x),
@@ -211,25 +211,25 @@ ANSWERS = {
 
 
 class Answering(nn.Module):
-    """The net's output, read by `answer`."""
+    """The net's output, read by `output`."""
 
-    def __init__(self, net, answer):
+    def __init__(self, net, output):
         super().__init__()
         self.net = net
-        self.answer = answer
+        self.output = output
 
     def forward(self, obs):
-        return self.answer(self.net(obs))
+        return self.output(self.net(obs))
 
 
-@pytest.mark.parametrize("name", ANSWERS)
+@pytest.mark.parametrize("name", OUTPUTS)
 @pytest.mark.parametrize("estimator", ["difference", "jvp"])
-def test_any_answer_is_measured_as_its_tensor(name, estimator):
+def test_any_output_is_measured_as_its_tensor(name, estimator):
     net, obs = mlp(), torch.randn(8, 4)
-    answer, tensor = ANSWERS[name]
+    output, tensor = OUTPUTS[name]
     regularizer = ConditioningRegularizer(coefficient=1.0, estimator=estimator)
     delta = regularizer.sample_delta(obs)
-    got = regularizer(Answering(net, answer), obs, delta=delta)
+    got = regularizer(Answering(net, output), obs, delta=delta)
     expected = regularizer(Answering(net, tensor), obs, delta=delta)
     torch.testing.assert_close(got.quotient, expected.quotient)
     got.penalty.backward()
@@ -237,18 +237,18 @@ def test_any_answer_is_measured_as_its_tensor(name, estimator):
 
 
 @pytest.mark.parametrize(
-    ("output", "tensor"),
+    ("select", "tensor"),
     [
         ("default", lambda x: x.log_softmax(-1)),
         ("logits", lambda x: x.log_softmax(-1)),
         ("probs", lambda x: x.softmax(-1)),
-        (lambda answer: answer.logits.exp(), lambda x: x.softmax(-1)),
+        (lambda output: output.logits.exp(), lambda x: x.softmax(-1)),
     ],
 )
-def test_output_selects_what_counts(output, tensor):
+def test_output_selects_what_counts(select, tensor):
     net, obs = mlp(), torch.randn(8, 4)
     policy = Answering(net, lambda x: td.Categorical(logits=x))
-    got = ConditioningRegularizer(output=output)(policy, obs)
+    got = ConditioningRegularizer(select=select)(policy, obs)
     expected = ConditioningRegularizer()(Answering(net, tensor), obs)
     torch.testing.assert_close(got.quotient, expected.quotient)
 
@@ -542,11 +542,11 @@ def test_bf16_observations_are_measured_under_autocast():
 
 COMPILABLE = {
     "plain": (mlp, lambda: torch.randn(8, 4), {}),
-    "one quotient": (mlp, lambda: torch.randn(8, 4), {"quotient": "batch"}),
+    "one quotient": (mlp, lambda: torch.randn(8, 4), {"reduction": "batch"}),
     "fraction": (mlp, lambda: torch.randn(8, 4), {"fraction": 0.5}),
     "coefficient 0": (mlp, lambda: torch.randn(8, 4), {"coefficient": 0.0}),
     "jvp": (mlp, lambda: torch.randn(8, 4), {"estimator": "jvp"}),
-    "Normal": (lambda: Answering(mlp(), ANSWERS["Normal"][0]), lambda: torch.randn(8, 4), {}),
+    "Normal": (lambda: Answering(mlp(), OUTPUTS["Normal"][0]), lambda: torch.randn(8, 4), {}),
     "dropout and batch norm": (stochastic, lambda: torch.randn(8, 4), {}),
     "dict": (Mixed, lambda: mixed_obs(8), {}),
     "leading axes": (mlp, lambda: torch.randn(3, 5, 4), {"batch_ndim": 2}),
@@ -622,14 +622,14 @@ def test_compiled_dropout_is_no_sensitivity():
         ),
         ({"lambda_min": -1.0}, ValueError, "got lambda_min=-1.0"),
         ({"lambda_max": math.nan}, ValueError, "lambda_max=nan"),
-        ({"quotient": "state"}, ValueError, "quotient must be 'sample' or 'batch', got 'state'"),
+        ({"reduction": "state"}, ValueError, "reduction must be 'sample' or 'batch', got 'state'"),
         ({"perturbation": "cube"}, ValueError, "perturbation must be one of"),
         ({"perturbation": 1.0}, TypeError, "perturbation must be a name or a callable, got float"),
         ({"radius": 0.0}, ValueError, "radius must be finite and above 0, got 0.0"),
         ({"radius": -1.0}, ValueError, "radius must be finite and above 0, got -1.0"),
         ({"radius": 2.0, "perturbation": sphere}, ValueError, "a callable sets its own size"),
-        ({"output": "variance"}, ValueError, "output must be one of"),
-        ({"output": None}, TypeError, "output must be a name or a callable, got NoneType"),
+        ({"select": "variance"}, ValueError, "select must be one of"),
+        ({"select": None}, TypeError, "select must be a name or a callable, got NoneType"),
         ({"fraction": 0.0}, ValueError, "fraction must be in (0, 1], got 0.0"),
         ({"fraction": 1.5}, ValueError, "fraction must be in (0, 1], got 1.5"),
         ({"fraction": math.nan}, ValueError, "fraction must be in (0, 1], got nan"),
@@ -671,7 +671,7 @@ def test_observations_are_refused(obs, error, message):
 
 @pytest.mark.parametrize("estimator", ["difference", "jvp"])
 @pytest.mark.parametrize(
-    ("answer", "error", "message"),
+    ("output", "error", "message"),
     [
         (lambda x: x.mean(0), ValueError, "begin with the batch axes (6,) of the observations"),
         (lambda x: x.detach(), ValueError, "the policy's output has no gradient"),
@@ -681,13 +681,13 @@ def test_observations_are_refused(obs, error, message):
             "the policy's output must be floating, got torch.int64",
         ),
         (lambda x: "left", TypeError, "a policy must return a Tensor, a Distribution, or a tuple"),
-        (lambda x: (), ValueError, "the policy's answer holds no tensor"),
+        (lambda x: (), ValueError, "the policy's output holds no tensor"),
         (lambda x: td.Gamma(x.exp(), 1.0), TypeError, "no default output for Gamma"),
     ],
 )
-def test_an_answer_is_refused(estimator, answer, error, message):
+def test_an_output_is_refused(estimator, output, error, message):
     with pytest.raises(error, match=re.escape(message)):
-        ConditioningRegularizer(estimator=estimator)(Answering(mlp(), answer), OBS)
+        ConditioningRegularizer(estimator=estimator)(Answering(mlp(), output), OBS)
 
 
 def test_a_policy_without_gradient_can_be_measured():
@@ -698,8 +698,8 @@ def test_a_policy_without_gradient_can_be_measured():
 
 
 def test_a_selector_that_returns_nothing_is_refused():
-    with pytest.raises(ValueError, match="the output selector returned None"):
-        ConditioningRegularizer(output=lambda answer: None)(mlp(), OBS)
+    with pytest.raises(ValueError, match="select returned None"):
+        ConditioningRegularizer(select=lambda output: None)(mlp(), OBS)
 
 
 @pytest.mark.parametrize(

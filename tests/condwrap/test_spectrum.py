@@ -476,7 +476,7 @@ def test_orthogonal_maps_leave_the_spectrum_as_it_is(seed, m, n):
 
 
 class Mixed(nn.Module):
-    """Linear in an image and a vector; the mode scales the answer."""
+    """Linear in an image and a vector; the mode scales the output."""
 
     def __init__(self):
         super().__init__()
@@ -515,30 +515,30 @@ def test_uint8_images_are_measured_in_the_units_after_division(measure):
     assert net[0].weight.grad.abs().sum() > 0
 
 
-ANSWERS = [
+OUTPUTS = [
     (lambda x: td.Normal(x, 1.0), lambda x: x, "default"),
     (lambda x: td.Categorical(logits=x), lambda x: x.log_softmax(-1), "default"),
     (lambda x: td.Categorical(logits=x), lambda x: x.softmax(-1), "probs"),
-    (lambda x: {"pi": x, "v": x[:, :2]}, lambda x: x[:, :2], lambda answer: answer["v"]),
+    (lambda x: {"pi": x, "v": x[:, :2]}, lambda x: x[:, :2], lambda output: output["v"]),
 ]
 
 
 @every_measure
-@pytest.mark.parametrize(("answer", "tensor", "output"), ANSWERS)
-def test_output_selects_what_counts(measure, answer, tensor, output):
+@pytest.mark.parametrize(("output", "tensor", "select"), OUTPUTS)
+def test_output_selects_what_counts(measure, output, tensor, select):
     net, obs = mlp(), torch.randn(4, 4)
-    got = measure(lambda x: answer(net(x)), obs, output=output)
+    got = measure(lambda x: output(net(x)), obs, select=select)
     expected = measure(lambda x: tensor(net(x)), obs)
     if measure is condition_number:  # of a Categorical it is all rounding
         got, expected = got.clamp(max=1e4), expected.clamp(max=1e4)
     torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("output", ["logits", "probs"])
+@pytest.mark.parametrize("select", ["logits", "probs"])
 @pytest.mark.parametrize("n", [4, 12])
-def test_a_categorical_has_one_output_too_many(output, n):
+def test_a_categorical_has_one_output_too_many(select, n):
     net, obs = mlp(n, 3), torch.randn(4, n)
-    got = condition_number(lambda x: td.Categorical(logits=net(x)), obs, output=output)
+    got = condition_number(lambda x: td.Categorical(logits=net(x)), obs, select=select)
     assert got.min() > 1e5
     assert condition_number(net, obs).max() < 1e3
 
@@ -708,8 +708,8 @@ def test_a_count_below_1_is_refused(measure, name, value):
         (torch.ones(0, 4), {}, ValueError, "obs must not be empty, got shapes [(0, 4)]"),
         (torch.ones(3, 4) * math.nan, {}, ValueError, "obs must be finite, got NaN or infinity"),
         (torch.ones(3, 4).long(), {}, TypeError, "obs must be floating or uint8, got torch.int64"),
-        (torch.ones(3, 4), {"output": "variance"}, ValueError, "output must be one of"),
-        (torch.ones(3, 4), {"output": "mean_"}, ValueError, "got 'mean_'"),
+        (torch.ones(3, 4), {"select": "variance"}, ValueError, "select must be one of"),
+        (torch.ones(3, 4), {"select": "mean_"}, ValueError, "got 'mean_'"),
     ],
 )
 def test_what_cannot_be_read_is_refused(measure, obs, options, error, message):
@@ -725,6 +725,6 @@ def test_what_cannot_be_read_is_refused(measure, obs, options, error, message):
         (lambda x: x.argmax(-1), TypeError, "output must be floating, got torch.int64"),
     ],
 )
-def test_an_answer_is_refused(measure, policy, error, message):
+def test_an_output_is_refused(measure, policy, error, message):
     with pytest.raises(error, match=re.escape(message)):
         measure(policy, torch.ones(3, 4))

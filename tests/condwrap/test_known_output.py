@@ -1,4 +1,4 @@
-"""`answer`: what the loss computed anyway, in place of one of the regularizer's two forwards."""
+"""`output`: what the loss computed anyway, in place of one of the regularizer's two forwards."""
 
 import pytest
 import torch
@@ -16,21 +16,21 @@ def gaussian(net):
     return lambda obs: Independent(Normal(net(obs), 1.0), 1)
 
 
-def measure(policy, obs, net, answer, **settings):
+def measure(policy, obs, net, output, **settings):
     regularizer = ConditioningRegularizer(1.0, seed=1, **settings)
-    measured = regularizer(policy, obs, answer=answer)
+    measured = regularizer(policy, obs, output=output)
     gradients = torch.autograd.grad(measured.penalty, list(net.parameters()))
     return [measured.penalty, measured.quotient, *gradients]
 
 
 @pytest.mark.parametrize("fraction", [1.0, 0.3])
-@pytest.mark.parametrize("quotient", ["sample", "batch"])
+@pytest.mark.parametrize("reduction", ["sample", "batch"])
 @pytest.mark.parametrize(
     "wrap", [lambda net: net, gaussian, lambda net: lambda obs: Categorical(logits=net(obs))]
 )
-def test_the_result_and_its_gradients_are_those_without_it(wrap, quotient, fraction):
+def test_the_result_and_its_gradients_are_those_without_it(wrap, reduction, fraction):
     net, obs = mlp(), torch.randn(10, 4)
-    policy, settings = wrap(net), {"quotient": quotient, "fraction": fraction}
+    policy, settings = wrap(net), {"reduction": reduction, "fraction": fraction}
     expected = measure(policy, obs, net, None, **settings)
     torch.testing.assert_close(measure(policy, obs, net, policy(obs), **settings), expected)
 
@@ -43,47 +43,47 @@ def test_it_saves_one_evaluation():
         return net(obs)
 
     obs = torch.randn(5, 4)
-    ConditioningRegularizer()(policy, obs, answer=net(obs))
+    ConditioningRegularizer()(policy, obs, output=net(obs))
     assert len(seen) == 1
     assert not torch.equal(seen[0], obs)
 
 
-def test_an_answer_without_a_gradient_is_refused_where_the_penalty_needs_one():
+def test_an_output_without_a_gradient_is_refused_where_the_penalty_needs_one():
     net, obs = mlp(), torch.randn(5, 4)
     with torch.no_grad():
-        answer = net(obs)
+        output = net(obs)
     with pytest.raises(ValueError, match="no gradient"):
-        ConditioningRegularizer()(net, obs, answer=answer)
-    assert ConditioningRegularizer(0.0)(net, obs, answer=answer).psi.shape == (5,)
+        ConditioningRegularizer()(net, obs, output=output)
+    assert ConditioningRegularizer(0.0)(net, obs, output=output).psi.shape == (5,)
 
 
 def test_half_precision_is_refused():
     net, obs = mlp(), torch.randn(5, 4)
     with torch.autocast("cpu", torch.bfloat16):
-        answer = net(obs)
+        output = net(obs)
     with pytest.raises(ValueError, match=r"float32 at least, got torch.bfloat16"):
-        ConditioningRegularizer()(net, obs, answer=answer)
+        ConditioningRegularizer()(net, obs, output=output)
 
 
 @pytest.mark.parametrize("layer", [nn.Dropout(0.5), nn.BatchNorm1d(4)])
 def test_a_policy_that_changes_in_training_is_refused(layer):
     policy, obs = nn.Sequential(layer, nn.Linear(4, 2)), torch.randn(5, 4)
     with pytest.raises(ValueError, match=type(layer).__name__):
-        ConditioningRegularizer()(policy, obs, answer=policy(obs))
+        ConditioningRegularizer()(policy, obs, output=policy(obs))
     policy.eval()
-    assert ConditioningRegularizer()(policy, obs, answer=policy(obs)).psi.shape == (5,)
+    assert ConditioningRegularizer()(policy, obs, output=policy(obs)).psi.shape == (5,)
 
 
-def test_an_answer_to_other_observations_is_refused():
+def test_an_output_to_other_observations_is_refused():
     net, obs = mlp(), torch.randn(5, 4)
     with pytest.raises(ValueError, match="batch axes"):
-        ConditioningRegularizer()(net, obs, answer=net(torch.randn(6, 4)))
+        ConditioningRegularizer()(net, obs, output=net(torch.randn(6, 4)))
 
 
 def test_jvp_refuses_it():
     net, obs = mlp(), torch.randn(5, 4)
     with pytest.raises(ValueError, match="difference"):
-        ConditioningRegularizer(estimator="jvp")(net, obs, answer=net(obs))
+        ConditioningRegularizer(estimator="jvp")(net, obs, output=net(obs))
 
 
 def test_dropout_inside_a_recurrent_layer_is_refused():
@@ -93,4 +93,4 @@ def test_dropout_inside_a_recurrent_layer_is_refused():
         return gru(obs[:, None])[0][:, 0]
 
     with pytest.raises(ValueError, match="GRU"):
-        ConditioningRegularizer()(policy, obs, answer=policy(obs))
+        ConditioningRegularizer()(policy, obs, output=policy(obs))
