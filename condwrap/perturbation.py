@@ -1,9 +1,10 @@
 """Pure maps from standard-normal noise to a perturbation delta.
 
 Each takes noise `[..., n]`, one row for each state with all of its observation flattened, and
-returns delta `[..., n]` in the same dtype. They hold no randomness: whoever draws the noise owns
-the generator. NumPy arrays and PyTorch tensors work in all three, as does any other Array API
-array in `sphere` and `gaussian`.
+returns delta `[..., n]` in the same dtype. `radius` is the root-mean-square length of delta in all
+three, E[‖delta‖²] = radius², so kinds of delta can be compared at one radius. The maps hold no
+randomness: whoever draws the noise owns the generator. NumPy arrays and PyTorch tensors work in all
+three, as does any other Array API array in `sphere` and `gaussian`.
 """
 
 from __future__ import annotations
@@ -48,11 +49,13 @@ def sphere(noise: Array, radius: float = 1.0) -> Array:
 
 
 def gaussian(noise: Array, radius: float = 1.0) -> Array:
-    """Independent normal coordinates of standard deviation `radius`: delta = radius · noise.
+    """Independent normal coordinates: delta = radius / √n · noise.
+
+    For a standard deviation s of each coordinate pass radius = s · √n.
 
     Args:
         noise: Standard-normal noise, `[..., n]`, floating.
-        radius: Standard deviation of each coordinate, above 0, in the units of the observation.
+        radius: Root-mean-square length of delta, above 0, in the units of the observation.
 
     Returns:
         delta, `[..., n]`.
@@ -62,22 +65,23 @@ def gaussian(noise: Array, radius: float = 1.0) -> Array:
 
     Example:
         >>> import numpy as np
-        >>> gaussian(np.array([[3.0, 4.0]]), radius=0.5)
-        array([[1.5, 2. ]])
+        >>> gaussian(np.array([[1.0, 2.0, 2.0, 0.0]]), radius=0.5)
+        array([[0.25, 0.5 , 0.5 , 0.  ]])
     """
     check_radius(radius)
     namespace(noise=noise)
-    return noise * radius
+    return noise * (radius / math.sqrt(noise.shape[-1]))
 
 
 def uniform(noise: Array, radius: float = 1.0) -> Array:
-    """Independent uniform coordinates in (-radius, radius): delta = radius · erf(noise / √2).
+    """Independent uniform coordinates: delta = radius · √(3 / n) · erf(noise / √2).
 
-    2·Phi(z) - 1 = erf(z / √2) maps a standard-normal z to the uniform distribution on (-1, 1).
+    2·Phi(z) - 1 = erf(z / √2) maps a standard-normal z to the uniform distribution on (-1, 1),
+    whose mean square is 1/3. For coordinates in (-a, a) pass radius = a · √(n / 3).
 
     Args:
         noise: Standard-normal noise, `[..., n]`, floating, a NumPy array or PyTorch tensor.
-        radius: Half-width of each coordinate, above 0, in the units of the observation.
+        radius: Root-mean-square length of delta, above 0, in the units of the observation.
 
     Returns:
         delta, `[..., n]`.
@@ -88,15 +92,16 @@ def uniform(noise: Array, radius: float = 1.0) -> Array:
 
     Example:
         >>> import numpy as np
-        >>> uniform(np.array([[0.0, 100.0]]), radius=2.0)
-        array([[0., 2.]])
+        >>> uniform(np.array([[0.0, 0.0, 100.0]]), radius=2.0)
+        array([[0., 0., 2.]])
     """
     check_radius(radius)
     namespace(noise=noise)
+    half_width = radius * math.sqrt(3 / noise.shape[-1])
     if isinstance(noise, torch.Tensor):
-        return radius * torch.erf(noise / math.sqrt(2))
+        return half_width * torch.erf(noise / math.sqrt(2))
     if array_api_compat.is_numpy_array(noise):  # NumPy has no erf
-        return radius * torch.erf(torch.from_numpy(noise / math.sqrt(2))).numpy()
+        return half_width * torch.erf(torch.from_numpy(noise / math.sqrt(2))).numpy()
     raise TypeError(f"noise must be a NumPy array or a PyTorch tensor, got {type(noise).__name__}")
 
 

@@ -31,7 +31,8 @@ class PerturbObservation(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
         env: The environment, its normalization of observations inside this wrapper.
         perturbation: "sphere", "gaussian" or "uniform", or a map from standard-normal noise `[n]`
             to delta `[n]`.
-        radius: Size of a named perturbation, above 0 (see `condwrap.perturbation`).
+        radius: Root-mean-square length of a named perturbation, above 0 (see
+            `condwrap.perturbation`).
 
     Raises:
         TypeError: The observation space has no floating or uint8 Box.
@@ -80,7 +81,8 @@ class VectorPerturbObservation(VectorWrapper[Any, Any, Any, Any, Any], RecordCon
 
     Environment i draws from a generator of its own, seeded as `PerturbObservation` in environment
     i would be, so both give the same observations. `info` has the same keys as well: `clean_obs`
-    and, in SAME_STEP mode, a perturbed `final_obs` with `final_info["clean_obs"]` beside it.
+    and, in SAME_STEP mode, a perturbed `final_obs` with `final_info["clean_obs"]` beside it. The
+    attribute `clean_obs` holds the clean observations of the last reset or step.
 
     Args:
         env: The vector environment, its normalization of observations inside this wrapper.
@@ -111,6 +113,7 @@ class VectorPerturbObservation(VectorWrapper[Any, Any, Any, Any, Any], RecordCon
         self._map = get_perturbation(perturbation, radius)
         self._noise_rngs = [_noise_rng(None) for _ in range(self.num_envs)]
         self._shown: list[Any] = [None] * self.num_envs  # what each environment showed last
+        self.clean_obs: Any = None
 
     def reset(
         self,
@@ -127,6 +130,7 @@ class VectorPerturbObservation(VectorWrapper[Any, Any, Any, Any, Any], RecordCon
             for i, own_seed in enumerate(seeds):
                 if mask[i] and own_seed is not None:
                     self._noise_rngs[i] = _noise_rng(own_seed)
+        self.clean_obs = obs
         return self._show(obs, mask), {**info, "clean_obs": obs, "_clean_obs": mask}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -136,6 +140,7 @@ class VectorPerturbObservation(VectorWrapper[Any, Any, Any, Any, Any], RecordCon
             info = self._perturb_final(info)
         everything = np.ones(self.num_envs, dtype=np.bool_)
         info = {**info, "clean_obs": obs, "_clean_obs": everything}
+        self.clean_obs = obs
         return self._show(obs, everything), rewards, terminations, truncations, info
 
     def _perturb_final(self, info: dict[str, Any]) -> dict[str, Any]:
