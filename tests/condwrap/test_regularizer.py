@@ -12,7 +12,7 @@ from torch import distributions as td
 from torch import nn
 from torch.nn.utils import parametrizations
 
-from condwrap import ConditioningRegularizer, sphere
+from condwrap import Conditioning, ConditioningRegularizer, sphere
 from tests.condwrap.helpers import stochastic
 
 # PyTorch itself scripts what forward mode and inductor import
@@ -724,3 +724,46 @@ def test_a_perturbation_must_keep_the_shape(perturbation, got):
     message = "perturbation must map noise of shape (6, 4) to a delta of that shape, " + got
     with pytest.raises(ValueError, match=re.escape(message)):
         ConditioningRegularizer(perturbation=perturbation)(mlp(), OBS)
+
+
+# --- metrics and the printed sign ----------------------------------------------------------------
+
+
+def test_metrics_by_hand():
+    quotient = torch.tensor([0.5, 2.0, 2.0, 3.0, 25.0])
+    conditioning = Conditioning(
+        penalty=torch.tensor(0.0),
+        psi=torch.tensor([0.25, 0.0, 0.0, 0.0, 25.0]),
+        quotient=quotient,
+        fraction_below=torch.tensor(0.2),
+        fraction_above=torch.tensor(0.2),
+    )
+    expected = {
+        "a/psi": 5.05,
+        "a/quotient_q05": 0.5 + 0.2 * 1.5,
+        "a/quotient_q50": 2.0,
+        "a/quotient_q95": 3.0 + 0.8 * 22.0,
+        "a/quotient_squared": (0.25 + 4 + 4 + 9 + 625) / 5,
+        "a/fraction_below": 0.2,
+        "a/fraction_above": 0.2,
+    }
+    assert conditioning.metrics("a/") == pytest.approx(expected)
+    assert all(name.startswith("conditioning/") for name in conditioning.metrics())
+
+
+def test_metrics_of_one_quotient_for_the_batch():
+    net, obs = mlp(), torch.randn(6, 4)
+    conditioning = ConditioningRegularizer(reduction="batch")(net, obs)
+    metrics = conditioning.metrics("")
+    quotient = conditioning.quotient.item()
+    assert metrics["quotient_q05"] == metrics["quotient_q95"] == pytest.approx(quotient)
+    assert metrics["psi"] == pytest.approx(conditioning.psi.item())
+
+
+@pytest.mark.parametrize("coefficient", [0.0, 0.5])
+def test_the_printed_sign_negates_the_penalty(coefficient):
+    net, obs = mlp(), torch.randn(6, 4)
+    penalty = ConditioningRegularizer(coefficient)(net, obs).penalty
+    printed = ConditioningRegularizer(coefficient, printed_sign=True)(net, obs).penalty
+    assert printed.item() == -penalty.item()
+    assert (penalty.item() > 0) == (coefficient > 0)
