@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import math
 
 import gymnasium as gym
@@ -14,24 +16,34 @@ from gymnasium.wrappers.utils import RunningMeanStd
 from baselines import ppo_reg
 from baselines.ppo_reg import (
     Args,
+    DivergedError,
     NormalizeObservation,
     Rollout,
+    RunError,
     RunningMoments,
+    actor_loss,
     gae,
-    policy_loss,
     train,
 )
-from tests.baselines.helpers import pendulum, read_metrics, weights
+from tests.baselines.helpers import pendulum, read_metrics, weights, without_speed
 
 
 class Count(gym.Env):
-    """Shows how many steps have been taken; ends in the ways it is told to."""
+    """Shows how many steps have been taken; ends in the ways it is told to.
+
+    `reward` maps the count to a reward, and `actions` lists what was executed.
+    """
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
     action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
 
-    def __init__(self, terminate_at: float = math.inf, truncate_at: float = math.inf) -> None:
-        self.terminate_at, self.truncate_at = terminate_at, truncate_at
+    def __init__(
+        self, terminate_at: float = math.inf, truncate_at: float = math.inf, reward=lambda n: 1.0
+    ) -> None:
+        self.terminate_at = terminate_at
+        self.truncate_at = truncate_at
+        self.reward = reward
+        self.actions = []
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -40,8 +52,9 @@ class Count(gym.Env):
 
     def step(self, action):
         self.count += 1
+        self.actions.append(action.copy())
         ended = self.count >= self.terminate_at, self.count >= self.truncate_at
-        return self._obs(), 1.0, *ended, {}
+        return self._obs(), self.reward(self.count), *ended, {}
 
     def _obs(self):
         return np.array([self.count], np.float32)
@@ -52,7 +65,7 @@ def make_rollout(rewards, values, next_values, dones) -> Rollout:
     values, next_values = (
         torch.tensor(x, dtype=torch.float32)[:, None] for x in (values, next_values)
     )
-    return Rollout(None, None, *columns, values, next_values, None, [], [])
+    return Rollout(None, None, *columns, values, next_values, None, [], [], None)
 
 
 # --- mathematics ---------------------------------------------------------------------------------
@@ -77,21 +90,212 @@ def test_gae_with_lambda_1_is_the_discounted_return_minus_the_value():
     torch.testing.assert_close(gae(data, 0.9, 1.0).flatten().double(), expected, atol=1e-5, rtol=0)
 
 
-def test_policy_loss_by_hand():
+class Fixed(torch.nn.Module):
+    """A policy of mean w · obs and one log-std."""
+
+    def __init__(self, weight: float = 2.0, log_std: float = 0.5) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.tensor(weight))
+        self.log_std = torch.nn.Parameter(torch.tensor([log_std]))
+
+    def mean(self, obs):
+        return self.weight * obs
+
+    def forward(self, obs):
+        return ppo_reg.Actor.forward(self, obs)
+
+
+def fixed_learner(args: Args, **changes) -> ppo_reg.Learner:
+    """A learner of Count's numbers: mean 2 · obs, log-std 0.5, value 3 · obs."""
+    learner = ppo_reg.Learner(dataclasses.replace(args, env_id="MountainCarContinuous-v0"))
+    learner.actor = Fixed(**changes)
+    learner.critic = torch.nn.Linear(1, 1, bias=False)
+    learner.critic.weight.data.fill_(3.0)
+    return learner
+
+
+def normal_logprob(action: float, mean: float, log_std: float) -> float:
+    scaled = (action - mean) / math.exp(log_std)
+    return -0.5 * scaled**2 - log_std - 0.5 * math.log(2 * math.pi)
+
+
+def test_actor_loss_by_hand():
     # advantages [1, -1] are normalized to ±1/√2; ratios 1.5 and 0.5, clipped to 1.2 and 0.8
-    logratio, advantages = torch.tensor([1.5, 0.5]).log(), torch.tensor([1.0, -1.0])
-    loss, kl, clipfrac = policy_loss(logratio, advantages, 0.2)
-    assert loss.item() == pytest.approx(-(1.2 - 0.8) / math.sqrt(2) / 2, rel=1e-6)
-    assert kl.item() == pytest.approx(-(math.log(1.5) + math.log(0.5)) / 2, rel=1e-6)
-    assert clipfrac.item() == 1.0
+    args = Args(ent_coef=0.1)
+    obs = torch.tensor([[1.0], [2.0]])
+    actions = torch.tensor([[1.0], [6.0]])
+    logprobs = [normal_logprob(1.0, 2.0, 0.5), normal_logprob(6.0, 4.0, 0.5)]
+    old = torch.tensor(logprobs) - torch.tensor([1.5, 0.5]).log()
+    loss, logs = actor_loss(args, fixed_learner(args), obs, actions, old, torch.tensor([1.0, -1.0]))
+    pg_loss = -(1.2 - 0.8) / math.sqrt(2) / 2
+    entropy = 0.5 * math.log(2 * math.pi * math.e) + 0.5
+    kl = -(math.log(1.5) + math.log(0.5)) / 2
+    assert logs.tolist() == pytest.approx([pg_loss, entropy, kl, 1.0], rel=1e-5)
+    assert loss.item() == pytest.approx(pg_loss - 0.1 * entropy, rel=1e-5)
 
 
-def test_policy_gradient_at_ratio_1_is_that_of_the_plain_objective():
-    logratio = torch.zeros(8, requires_grad=True)
-    advantages = torch.randn(8, generator=torch.Generator().manual_seed(0))
-    policy_loss(logratio, advantages, 0.2)[0].backward()
-    normalized = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-    torch.testing.assert_close(logratio.grad, -normalized / 8)
+def test_the_penalty_is_added_to_the_actor_loss():
+    """The slope is 2 and lambda_max 1.5, so psi is 0.25 in every state."""
+    args = Args(coefficient=3.0, lambda_min=0.0, lambda_max=1.5)
+    learner = fixed_learner(args)
+    batch = (torch.ones(2, 1), torch.ones(2, 1), torch.zeros(2), torch.tensor([1.0, 2.0]))
+    plain, _ = actor_loss(args, learner, *batch)
+    penalized, _ = actor_loss(args, learner, *batch, torch.ones(2, 1))
+    assert (penalized - plain).item() == pytest.approx(3.0 * 0.25, rel=1e-5)
+
+
+def test_one_update_by_hand():
+    """One step of plain gradient descent on one minibatch, against float64 written out here."""
+    settings = {"update_epochs": 1, "vf_epochs": 1, "ent_coef": 0.2, "vf_coef": 0.7}
+    args = Args(
+        num_steps=4,
+        num_minibatches=1,
+        coefficient=0.9,
+        lambda_min=2.5,
+        max_grad_norm=1e9,
+        gamma=0.9,
+        gae_lambda=0.8,
+        **settings,
+    )
+    learner = fixed_learner(args)
+    learner.actor_optimizer = torch.optim.SGD(learner.actor.parameters(), 0.01)
+    learner.critic_optimizer = torch.optim.SGD(learner.critic.parameters(), 0.01)
+    obs = torch.tensor([0.0, 1.0, 2.0, -1.0])
+    actions = torch.tensor([0.5, 1.0, 6.0, -1.0])
+    rewards = torch.tensor([1.0, -2.0, 0.5, 4.0])
+    values = 3 * obs
+    next_values = torch.tensor([3.0, 6.0, 0.0, 7.0])
+    dones = torch.tensor([0.0, 0.0, 1.0, 0.0])
+    columns = [x[:, None] for x in (rewards, dones, values, next_values)]
+    data = Rollout(obs[:, None, None], actions[:, None, None], *columns, None, [], [], None)
+
+    learner.update = 1
+    logs = ppo_reg.update(args, learner, data)
+
+    errors = (rewards + 0.9 * next_values - values).double().tolist()
+    advantages = [0.0] * 4
+    following = 0.0
+    for t in (3, 2, 1, 0):
+        following = errors[t] + 0.9 * 0.8 * (1 - dones[t].item()) * following
+        advantages[t] = following
+    raw = np.array(advantages)
+    scaled = (raw - raw.mean()) / raw.std(ddof=1)
+    x = obs.double().numpy()
+    noise = (actions.double().numpy() - 2 * x) / math.exp(0.5)  # in standard deviations
+    # d log pi / d w = noise · x / std and d log pi / d log_std = noise² - 1; ratios are 1
+    weight_grad = -(scaled * noise * x / math.exp(0.5)).mean()
+    weight_grad += 0.9 * 2 * (2.0 - 2.5)  # c1 · d (J - 2.5)² / dw with J = w = 2
+    log_std_grad = -(scaled * (noise**2 - 1)).mean() - 0.2
+    critic_grad = 0.7 * (2 * (3 * x - (raw + 3 * x)) * x).mean()
+    assert learner.actor.weight.item() == pytest.approx(2.0 - 0.01 * weight_grad, rel=1e-5)
+    assert learner.actor.log_std.item() == pytest.approx(0.5 - 0.01 * log_std_grad, rel=1e-5)
+    assert learner.critic.weight.item() == pytest.approx(3.0 - 0.01 * critic_grad, rel=1e-5)
+    assert logs["losses/value_loss"] == pytest.approx((raw**2).mean(), rel=1e-5)
+    targets = raw + 3 * x
+    explained = 1 - raw.var() / targets.var()
+    assert logs["losses/explained_variance"] == pytest.approx(explained, rel=1e-4)
+    # before the first step the share compares the penalty's gradient with the rest's
+    assert math.isnan(logs["conditioning/gradient_share"])
+    again = fixed_learner(args)
+    again.update = 25
+    logs = ppo_reg.update(args, again, data)
+    rest = math.hypot(weight_grad + 0.9, log_std_grad)
+    assert logs["conditioning/gradient_share"] == pytest.approx(0.9 / rest, rel=1e-4)
+
+
+def test_gradients_are_clipped_to_the_given_length():
+    args = Args(num_steps=4, num_minibatches=1, update_epochs=1, vf_epochs=1, max_grad_norm=0.25)
+    learner = fixed_learner(args)
+    learner.actor_optimizer = torch.optim.SGD(learner.actor.parameters(), 1.0)
+    learner.critic_optimizer = torch.optim.SGD(learner.critic.parameters(), 1.0)
+    columns = [torch.tensor(x)[:, None] for x in ([9.0, 0.0, -9.0, 5.0], [0.0] * 4)]
+    obs = torch.tensor([0.0, 1.0, 2.0, -1.0])[:, None]
+    data = Rollout(
+        obs[..., None], 2 * obs[..., None] + 3, *columns, 3 * obs, obs, None, [], [], None
+    )
+    before = [3.0, 2.0, 0.5]
+    ppo_reg.update(args, learner, data)
+    assert abs(learner.critic.weight.item() - before[0]) == pytest.approx(0.25, rel=1e-4)
+    moved = [learner.actor.weight.item() - before[1], learner.actor.log_std.item() - before[2]]
+    assert math.hypot(*moved) == pytest.approx(0.25, rel=1e-4)
+
+
+@pytest.mark.parametrize(("number", "left"), [(1, 1.0), (2, 0.8), (5, 0.2)])
+def test_step_sizes_fall_linearly_to_0(tmp_path, number, left):
+    args = pendulum(ppo_reg, tmp_path, anneal_lr=True, learning_rate=0.01, vf_learning_rate=0.04)
+    train(args)
+    logged = float(read_metrics(tmp_path)[number - 1]["charts/learning_rate"])
+    assert logged == pytest.approx(0.01 * left)
+    if number == 5:
+        saved = torch.load(tmp_path / "checkpoint.pt", weights_only=True)["learner"]
+        group = saved["critic_optimizer"]["param_groups"][0]
+        assert group["lr"] == pytest.approx(0.04 * left)
+
+
+# --- settings ------------------------------------------------------------------------------------
+
+
+STANDARD = {
+    "env_id": "HopperBulletEnv-v0",
+    "seed": 1,
+    "agent": 0,
+    "total_timesteps": 5_000_000,
+    "num_envs": 1,
+    "num_steps": 2000,
+    "num_minibatches": 40,
+    "update_epochs": 10,
+    "learning_rate": 3e-4,
+    "vf_epochs": 10,
+    "vf_learning_rate": 3e-4,
+    "vf_coef": 0.5,
+    "anneal_lr": False,
+    "gamma": 0.99,
+    "gae_lambda": 0.95,
+    "clip_coef": 0.2,
+    "ent_coef": 0.0,
+    "max_grad_norm": 0.5,
+    "target_kl": None,
+    "hidden_sizes": (64, 64),
+    "activation": "tanh",
+    "output_gain": 0.01,
+    "log_std_init": 0.0,
+    "norm_obs": True,
+    "norm_reward": True,
+    "reward_clip": 10.0,
+    "run_dir": None,
+    "resume": False,
+    "extend": False,
+    "checkpoint_interval": 50,
+    "compile": False,
+    "track": False,
+}
+
+
+def test_the_defaults_are_the_standard_setting():
+    settings = dataclasses.asdict(Args())
+    conditioning = {"coefficient", "lambda_min", "lambda_max", "reduction", "perturbation"}
+    conditioning |= {"radius", "printed_sign", "probe_fraction", "log_spectrum", "perturb_obs"}
+    assert {k: v for k, v in settings.items() if k not in conditioning} == STANDARD
+    assert conditioning <= settings.keys()
+
+
+@pytest.mark.parametrize("output_gain", [0.01, 1.0])
+def test_networks_begin_orthogonal(output_gain):
+    learner = ppo_reg.Learner(
+        Args(env_id="Pendulum-v1", output_gain=output_gain, log_std_init=-1.0)
+    )
+    gains = {"actor": output_gain, "critic": 1.0}
+    for name, head_gain in gains.items():
+        layers = [m for m in getattr(learner, name).modules() if isinstance(m, torch.nn.Linear)]
+        assert len(layers) == 3
+        for layer, gain in zip(layers, (2**0.5, 2**0.5, head_gain), strict=True):
+            values = torch.linalg.svdvals(layer.weight)
+            torch.testing.assert_close(values, torch.full_like(values, gain))
+            assert not layer.bias.any()
+    assert learner.actor.log_std.tolist() == [-1.0]
+    for optimizer in (learner.actor_optimizer, learner.critic_optimizer):
+        assert optimizer.param_groups[0]["eps"] == 1e-5
+        assert optimizer.param_groups[0]["betas"] == (0.9, 0.999)
 
 
 # --- environments --------------------------------------------------------------------------------
@@ -102,12 +306,26 @@ def count_rollout(num_steps: int = 5, **ends) -> Rollout:
     envs = SyncVectorEnv([lambda: Count(**ends)], autoreset_mode=AutoresetMode.SAME_STEP)
     envs = gym.wrappers.vector.RecordEpisodeStatistics(envs)
     args = Args(env_id="Pendulum-v1", num_steps=num_steps, num_minibatches=1)
-    learner = ppo_reg.Learner(Args(env_id="MountainCarContinuous-v0"))
-    learner.actor = ppo_reg.Actor(args, 1, 1, torch.Generator())
-    learner.critic = torch.nn.Linear(1, 1, bias=False)
-    torch.nn.init.ones_(learner.critic.weight)
+    learner = fixed_learner(args)
+    learner.critic.weight.data.fill_(1.0)
     next_obs, _ = envs.reset(seed=0)
     return ppo_reg.rollout(args, learner, envs, next_obs)
+
+
+def test_actions_are_mean_and_scaled_noise_and_executed_clipped():
+    env = Count()
+    envs = SyncVectorEnv([lambda: env], autoreset_mode=AutoresetMode.SAME_STEP)
+    args = Args(env_id="Pendulum-v1", num_steps=6, num_minibatches=1)
+    learner = fixed_learner(args, log_std=1.5)
+    noise = torch.randn(6, generator=learner.generators["action"].clone_state())
+    next_obs, _ = envs.reset(seed=0)
+    data = ppo_reg.rollout(args, learner, envs, next_obs)
+    expected = 2 * torch.arange(6.0) + math.exp(1.5) * noise
+    torch.testing.assert_close(data.actions.flatten(), expected)
+    executed = np.concatenate(env.actions)
+    np.testing.assert_allclose(executed, expected.clamp(-1, 1), rtol=1e-6)
+    assert (np.abs(executed) < 1).any() or (np.abs(executed) == 1).all()
+    assert data.values.flatten().tolist() == [0, 3, 6, 9, 12, 15]
 
 
 def test_a_truncated_episode_bootstraps_from_its_final_observation():
@@ -127,6 +345,45 @@ def test_a_terminated_episode_does_not_bootstrap():
 def test_termination_wins_over_truncation():
     data = count_rollout(terminate_at=3, truncate_at=3)
     assert data.next_values.flatten().tolist() == [1, 2, 0, 1, 2]
+
+
+def make_count_envs(tmp_path, monkeypatch, reward, **changes):
+    args = pendulum(ppo_reg, tmp_path, **changes)
+    monkeypatch.setattr(ppo_reg, "make_env", lambda args: Count(truncate_at=4, reward=reward))
+    envs = ppo_reg.make_envs(args, {})
+    envs.reset(seed=0)
+    return envs
+
+
+def test_rewards_are_divided_by_their_returns_deviation(tmp_path, monkeypatch):
+    rewards = [1.0, 5.0, -2.0, 3.0]
+    envs = make_count_envs(tmp_path, monkeypatch, lambda n: rewards[n - 1], gamma=0.5)
+    got = [envs.step(np.zeros((1, 1), np.float32))[1].item() for _ in rewards]
+    # Gymnasium's running moments begin as 1e-4 observations of mean 0 and variance 1
+    discounted = 0.0
+    mean = 0.0
+    squares = 1e-4
+    count = 1e-4
+    for reward, scaled in zip(rewards, got, strict=True):
+        discounted = 0.5 * discounted + reward
+        squares += (discounted - mean) ** 2 * count / (count + 1)
+        mean += (discounted - mean) / (count + 1)
+        count += 1
+        expected = reward / math.sqrt(squares / count + 1e-8)
+        assert scaled == pytest.approx(min(max(expected, -10), 10), rel=1e-4)
+
+
+def test_normalized_rewards_are_clipped(tmp_path, monkeypatch):
+    """The first discounted return has hardly a variance, so its reward becomes a large number."""
+
+    def first(**changes):
+        envs = make_count_envs(tmp_path, monkeypatch, lambda n: -0.5, **changes)
+        return envs.step(np.zeros((1, 1), np.float32))[1].item()
+
+    assert first(reward_clip=0) < -30
+    assert first() == -10.0
+    assert first(reward_clip=2.5) == -2.5
+    assert first(norm_reward=False, reward_clip=0.1) == -0.5
 
 
 def normalized_counts(update: bool = True) -> tuple[NormalizeObservation, RunningMeanStd]:
@@ -183,13 +440,12 @@ def test_observations_are_clipped():
     assert envs.normalize(np.array([[1e6]])).item() == 10.0
 
 
-def test_the_critic_and_the_policy_see_perturbed_observations_and_the_statistics_clean_ones(
-    tmp_path,
-):
+def test_the_statistics_see_clean_observations(tmp_path):
     stats_plain, stats_perturbed = {}, {}
     args = pendulum(ppo_reg, tmp_path)
-    plain = ppo_reg.make_envs(args, 0, stats_plain)
-    perturbed = ppo_reg.make_envs(pendulum(ppo_reg, tmp_path, perturb_obs=True), 0, stats_perturbed)
+    plain = ppo_reg.make_envs(args, stats_plain)
+    noisy_args = pendulum(ppo_reg, tmp_path, perturb_obs=True)
+    perturbed = noisy_args.perturb(ppo_reg.make_envs(noisy_args, stats_perturbed))
     seeds = ppo_reg.env_seeds(args, 0)
     obs, _ = plain.reset(seed=seeds)
     noisy, info = perturbed.reset(seed=seeds)
@@ -265,8 +521,159 @@ def test_it_learns(tmp_path):
     assert float(rows[-1]["charts/episodic_return"]) > 500
 
 
-@pytest.mark.slow
-def test_videos_are_recorded(tmp_path):
-    changes = {"env_id": "ReacherBulletEnv-v0", "num_steps": 200, "total_timesteps": 200}
-    train(pendulum(ppo_reg, tmp_path, **changes, capture_video=True))
-    assert any(v.stat().st_size > 1000 for v in (tmp_path / "videos").glob("*.mp4"))
+# --- what is measured ----------------------------------------------------------------------------
+
+
+def test_every_row_measures_the_new_policy_on_the_rollouts_clean_observations(
+    tmp_path, monkeypatch
+):
+    """psi of a row is that of the weights after the update, and noise does not enter it."""
+    seen = []
+    kept = ppo_reg.make_row
+
+    def spy(args, learner, data, losses, speed):
+        probe = args.make_probe(0)
+        probe.load_state_dict(learner.probe.state_dict())
+        expected = probe.measure(learner.update, learner.actor, data.clean_obs)
+        row = kept(args, learner, data, losses, speed)
+        seen.append((data, expected, row))
+        return row
+
+    monkeypatch.setattr(ppo_reg, "make_row", spy)
+    train(pendulum(ppo_reg, tmp_path, perturb_obs=True, radius=0.5))
+    assert len(seen) == 5
+    for data, expected, row in seen:
+        distance = (data.obs.flatten(0, 1) - data.clean_obs).norm(dim=-1)
+        torch.testing.assert_close(distance, torch.full((64,), 0.5))
+        assert row["conditioning/psi"] == expected["conditioning/psi"]
+
+
+def test_clean_observations_are_the_observations_where_nothing_perturbs_them(tmp_path):
+    args = pendulum(ppo_reg, tmp_path)
+    learner = ppo_reg.Learner(args)
+    envs = ppo_reg.make_envs(args, learner.stats)
+    next_obs, _ = envs.reset(seed=0)
+    data = ppo_reg.rollout(args, learner, envs, next_obs)
+    assert torch.equal(data.clean_obs, data.obs.flatten(0, 1))
+
+
+def test_the_gradient_share_is_logged_every_25th_update(tmp_path):
+    settings = {"num_steps": 16, "total_timesteps": 16 * 51, "update_epochs": 1, "vf_epochs": 1}
+    train(pendulum(ppo_reg, tmp_path / "reg", coefficient=0.1, **settings))
+    train(pendulum(ppo_reg, tmp_path / "plain", coefficient=0.0, **settings))
+    for name, wanted in (("reg", lambda x: 0 < x < 100), ("plain", lambda x: x == 0)):
+        rows = read_metrics(tmp_path / name)
+        shares = [float(row["conditioning/gradient_share"]) for row in rows]
+        due = [number for number, x in enumerate(shares, 1) if not math.isnan(x)]
+        assert due == [25, 50]
+        assert all(wanted(shares[number - 1]) for number in due)
+
+
+def test_rows_count_the_episodes_that_ended(tmp_path):
+    gym.register("test/Short-v0", lambda: Count(truncate_at=10))
+    train(pendulum(ppo_reg, tmp_path, env_id="test/Short-v0"))
+    # of 64 steps: 6, 12 after 128, 19 after 192, 25 after 256, 32 after 320
+    counts = [int(row["charts/episodes"]) for row in read_metrics(tmp_path)]
+    assert counts == [6, 6, 7, 6, 7]
+
+
+def test_the_printed_sign_raises_psi(tmp_path):
+    """From an output gain of 1, so that psi can move both ways."""
+    settings = {"coefficient": 1.0, "output_gain": 1.0, "learning_rate": 3e-3, "lambda_min": 2.0}
+    psi = {}
+    for sign in (False, True):
+        train(pendulum(ppo_reg, tmp_path / str(sign), printed_sign=sign, **settings))
+        psi[sign] = float(read_metrics(tmp_path / str(sign))[-1]["conditioning/own_psi"])
+    assert psi[True] > psi[False] + 0.1
+
+
+def test_one_quotient_for_the_minibatch_trains_otherwise(tmp_path):
+    settings = {"coefficient": 1.0}
+    by_state = train(pendulum(ppo_reg, tmp_path / "a", **settings))
+    by_batch = train(pendulum(ppo_reg, tmp_path / "b", reduction="batch", **settings))
+    assert not torch.equal(weights(by_state), weights(by_batch))
+    row = read_metrics(tmp_path / "b")[-1]
+    assert row["conditioning/own_quotient_q05"] == row["conditioning/own_quotient_q95"]
+    assert row["conditioning/quotient_q05"] != row["conditioning/quotient_q95"]
+
+
+# --- outcomes and longer runs --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("broken", "what"), [("reward", "reward"), ("observation", "observation")])
+def test_a_run_that_diverges_says_so_and_keeps_its_last_checkpoint(tmp_path, broken, what):
+    class Breaking(Count):
+        steps = 0
+
+        def step(self, action):
+            Breaking.steps += 1
+            obs, reward, *rest = super().step(action)
+            if Breaking.steps >= 3 * 64 + 10:
+                reward = math.inf if broken == "reward" else reward
+                obs = obs * math.nan if broken == "observation" else obs
+            return obs, reward, *rest
+
+    gym.register(f"test/Breaking-{broken}-v0", Breaking)
+    env_id = f"test/Breaking-{broken}-v0"
+    args = pendulum(ppo_reg, tmp_path, env_id=env_id, checkpoint_interval=2)
+    with np.errstate(invalid="ignore"), pytest.raises(DivergedError, match=f"the {what} became"):
+        train(args)
+    said = json.loads((tmp_path / "diverged.json").read_text())
+    assert said["update"] == 4
+    assert said["what"] == what
+    assert len(read_metrics(tmp_path)) == 3
+    saved = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    assert saved["learner"]["update"] == 2
+
+
+def test_weights_that_become_non_finite_are_an_outcome(tmp_path):
+    with pytest.raises(DivergedError, match="the loss became non-finite in update 1"):
+        train(pendulum(ppo_reg, tmp_path, vf_coef=math.inf))
+    assert read_metrics_or_none(tmp_path) == []
+
+
+def read_metrics_or_none(path):
+    return read_metrics(path) if (path / "metrics.csv").stat().st_size else []
+
+
+def test_the_program_ends_with_3_where_a_run_diverged(tmp_path, monkeypatch, capsys):
+    flags = ["--env-id=Pendulum-v1", "--num-steps=64", "--num-minibatches=4", "--vf-coef=inf"]
+    flags += ["--total-timesteps=64", f"--run-dir={tmp_path}"]
+    monkeypatch.setattr("sys.argv", ["ppo_reg.py", *flags])
+    with pytest.raises(SystemExit) as stopped:
+        ppo_reg.main()
+    assert stopped.value.code == 3
+    assert "the loss became non-finite in update 1" in capsys.readouterr().out
+
+
+def test_an_extended_run_is_the_longer_run_bit_for_bit(tmp_path):
+    longer = train(
+        pendulum(ppo_reg, tmp_path / "longer", checkpoint_interval=2, total_timesteps=384)
+    )
+    settings = {"checkpoint_interval": 2, "total_timesteps": 256}
+    train(pendulum(ppo_reg, tmp_path / "extended", **settings))
+    settings = {"checkpoint_interval": 2, "total_timesteps": 384, "resume": True, "extend": True}
+    extended = train(pendulum(ppo_reg, tmp_path / "extended", **settings))
+    assert torch.equal(weights(extended), weights(longer))
+    assert without_speed(tmp_path / "extended") == without_speed(tmp_path / "longer")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"total_timesteps": 640}, "was run with total_timesteps=320, not 640"),
+        ({"total_timesteps": 256, "extend": True}, "was run with total_timesteps=320, not 256"),
+        ({"gamma": 0.5, "extend": True}, "was run with gamma=0.99, not 0.5"),
+    ],
+)
+def test_what_cannot_be_extended_is_refused(tmp_path, changes, message):
+    train(pendulum(ppo_reg, tmp_path))
+    with pytest.raises(RunError, match=message):
+        train(pendulum(ppo_reg, tmp_path, resume=True, **changes))
+
+
+def test_an_annealed_run_cannot_be_extended(tmp_path):
+    train(pendulum(ppo_reg, tmp_path, anneal_lr=True))
+    longer = {"total_timesteps": 640, "resume": True, "extend": True}
+    with pytest.raises(RunError, match="depends on its length"):
+        train(pendulum(ppo_reg, tmp_path, anneal_lr=True, **longer))
