@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
@@ -12,6 +12,26 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 IMAGE_SCALE = 255.0  # uint8 observations are images, which policies divide by 255
+
+
+@dataclasses.dataclass(frozen=True)
+class Leaf:
+    """One tensor of an observation, and what a unit of delta is in its own units."""
+
+    tensor: Tensor
+    scale: float
+    """1 for floating tensors, the divisor of integer ones, 0 for a leaf that passes through"""
+
+    @property
+    def floating(self) -> Tensor:
+        return self.tensor if self.tensor.is_floating_point() else self.tensor.float()
+
+    def displacement(self, part: Tensor) -> Tensor:
+        """What its part of a flat delta adds to `floating`."""
+        shift = part.reshape(self.tensor.shape)
+        if self.tensor.is_floating_point():
+            return shift.to(self.tensor.dtype)  # its scale is 1
+        return shift.float() * self.scale
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,132 +43,158 @@ class States:
     are those with a scale, in the observation's order.
     """
 
-    leaves: list[Tensor]
-    scales: list[float | None]  # what a unit of delta is in the leaf's own units; None passes
+    leaves: list[Leaf]
     spec: Any
     batch_ndim: int
 
     @classmethod
     def read(cls, obs: Any, obs_scale: float | None, batch_ndim: int) -> States:
         """Take an observation apart and check it."""
-        leaves, spec = pytree.tree_flatten(obs)
-        for leaf in leaves:
-            if not isinstance(leaf, Tensor):
+        tensors, spec = pytree.tree_flatten(obs)
+        for x in tensors:
+            if not isinstance(x, Tensor):
                 raise TypeError(
-                    f"obs must be a Tensor or a dict of Tensors, got {type(leaf).__name__}"
+                    f"obs must be a Tensor or a dict of Tensors, got {type(x).__name__}"
                 )
-        if leaves and torch.is_autocast_enabled(leaves[0].device.type):  # J is taken in float32
-            half = (torch.bfloat16, torch.float16)
-            leaves = [leaf.float() if leaf.dtype in half else leaf for leaf in leaves]
-        scales = [_scale(leaf.dtype, obs_scale) for leaf in leaves]
-        if not any(scales):
-            kinds = ", ".join(str(leaf.dtype) for leaf in leaves) or "no tensor"
+        if tensors and torch.is_autocast_enabled(tensors[0].device.type):
+            tensors = [_at_least_float32(x) for x in tensors]
+
+        leaves = [Leaf(x, _scale(x.dtype, obs_scale)) for x in tensors]
+        if not any(leaf.scale for leaf in leaves):
+            kinds = ", ".join(str(x.dtype) for x in tensors) or "no tensor"
             raise TypeError(
                 f"obs must be floating or uint8, got {kinds}: for integers that the policy "
                 "divides, pass obs_scale=<the divisor>"
             )
-        shapes = [tuple(leaf.shape) for leaf in leaves]
-        batch = shapes[0][:batch_ndim]
-        if any(len(s) < batch_ndim or s[:batch_ndim] != batch for s in shapes):
-            raise ValueError(
-                f"obs needs batch_ndim={batch_ndim} leading axes that its leaves share, "
-                f"got shapes {shapes}"
-            )
-        if math.prod(batch) == 0:
-            raise ValueError(f"obs must not be empty, got shapes {shapes}")
-        floating = [leaf for leaf in leaves if leaf.is_floating_point()]
+
+        _check_shapes([tuple(x.shape) for x in tensors], batch_ndim)
+        floating = [x for x in tensors if x.is_floating_point()]
         compiling = torch.compiler.is_compiling()  # a graph holds no branch on data
-        if not (compiling or all(_is_finite(leaf) for leaf in floating)):
+        if not (compiling or all(_is_finite(x) for x in floating)):
             raise ValueError("obs must be finite, got NaN or infinity")
-        return cls(leaves, scales, spec, batch_ndim)
+        return cls(leaves, spec, batch_ndim)
+
+    @property
+    def tensors(self) -> list[Tensor]:
+        return [leaf.tensor for leaf in self.leaves]
 
     @property
     def batch(self) -> torch.Size:
-        return self.leaves[0].shape[: self.batch_ndim]
+        return self.tensors[0].shape[: self.batch_ndim]
 
     @property
     def device(self) -> torch.device:
-        return self.leaves[0].device
+        return self.tensors[0].device
 
     @property
     def dtype(self) -> torch.dtype:
         """Of delta: float64 for float64 observations, float32 otherwise."""
-        wide = any(leaf.dtype == torch.float64 for leaf in self.leaves)
+        wide = any(x.dtype == torch.float64 for x in self.tensors)
         return torch.float64 if wide else torch.float32
 
     @property
+    def moving(self) -> list[Leaf]:
+        """The perturbed leaves."""
+        return [leaf for leaf in self.leaves if leaf.scale]
+
+    @property
     def perturbed(self) -> list[Tensor]:
-        """The perturbed leaves, made floating."""
-        leaves = zip(self.leaves, self.scales, strict=True)
-        return [x if x.is_floating_point() else x.float() for x, scale in leaves if scale]
+        """The perturbed leaves' tensors, made floating."""
+        return [leaf.floating for leaf in self.moving]
 
     @property
     def sizes(self) -> list[int]:
         """Coordinates of each perturbed leaf in one state."""
-        leaves = zip(self.leaves, self.scales, strict=True)
-        return [math.prod(x.shape[self.batch_ndim :]) for x, scale in leaves if scale]
+        return [math.prod(leaf.tensor.shape[self.batch_ndim :]) for leaf in self.moving]
+
+    def with_tensors(self, tensors: Iterable[Tensor]) -> States:
+        """The same leaves with other tensors, such as some of the states."""
+        pairs = zip(self.leaves, tensors, strict=True)
+        return dataclasses.replace(self, leaves=[Leaf(x, leaf.scale) for leaf, x in pairs])
 
     def subset(self, fraction: float) -> States:
         """ceil(fraction · B) states, evenly spaced along the first axis."""
-        size = self.leaves[0].shape[0]
-        count = math.ceil(fraction * size - 1e-9)  # 0.55 · 100 is 55.00000000000001
-        if count == size:
+        if fraction == 1:
             return self
-        index = torch.arange(count, device=self.device) * size // count
-        return dataclasses.replace(self, leaves=[leaf[index] for leaf in self.leaves])
+        return self.with_tensors(take_evenly(x, fraction) for x in self.tensors)
 
     def chunks(self, size: int) -> list[States]:
         """The same states, at most `size` at a time along the first axis."""
-        parts = zip(*(torch.split(leaf, size) for leaf in self.leaves), strict=True)
-        return [dataclasses.replace(self, leaves=list(leaves)) for leaves in parts]
+        parts = zip(*(torch.split(x, size) for x in self.tensors), strict=True)
+        return [self.with_tensors(tensors) for tensors in parts]
 
     def obs(self, perturbed: Sequence[Tensor]) -> Any:
         """The observation, in its structure, with these perturbed leaves."""
         new = iter(perturbed)
-        leaves = zip(self.leaves, self.scales, strict=True)
-        return pytree.tree_unflatten([next(new) if scale else x for x, scale in leaves], self.spec)
+        tensors = [next(new) if leaf.scale else leaf.tensor for leaf in self.leaves]
+        return pytree.tree_unflatten(tensors, self.spec)
 
     def displacement(self, delta: Tensor) -> list[Tensor]:
         """What a flat delta, `[*batch, n]`, adds to each perturbed leaf, in that leaf's units."""
-        parts = iter(torch.split(delta, self.sizes, -1))
-        leaves = zip(self.leaves, self.scales, strict=True)
-        shifts = [(x, next(parts).reshape(x.shape), scale) for x, scale in leaves if scale]
-        # the scale of a floating leaf is 1
-        return [s.to(x.dtype) if x.is_floating_point() else s.float() * k for x, s, k in shifts]
+        parts = torch.split(delta, self.sizes, -1)
+        pairs = zip(self.moving, parts, strict=True)
+        return [leaf.displacement(part) for leaf, part in pairs]
 
     def unflatten(self, delta: Tensor) -> Any:
         """A flat delta, `[*batch, n]`, in the observation's structure; None where a leaf passes."""
         parts = iter(torch.split(delta, self.sizes, -1))
-        leaves = zip(self.leaves, self.scales, strict=True)
-        tree = [next(parts).reshape(x.shape) if scale else None for x, scale in leaves]
+        tree = [
+            next(parts).reshape(leaf.tensor.shape) if leaf.scale else None for leaf in self.leaves
+        ]
         return pytree.tree_unflatten(tree, self.spec)
 
     def flatten(self, delta: Any) -> Tensor:
         """A delta in the observation's structure, checked, as `[*batch, n]`."""
         try:
-            leaves = self.spec.flatten_up_to(delta)  # a dict by its keys, not by their order
+            given = self.spec.flatten_up_to(delta)  # a dict by its keys, not by their order
         except ValueError:
-            leaves = pytree.tree_leaves(delta)
-        got = [_shape(x) for x in leaves]
-        perturbed = zip(self.leaves, self.scales, strict=True)
-        want = [tuple(x.shape) if scale else None for x, scale in perturbed]
+            given = pytree.tree_leaves(delta)
+
+        got = [_shape(x) for x in given]
+        want = [tuple(leaf.tensor.shape) if leaf.scale else None for leaf in self.leaves]
         if got != want:
             raise ValueError(
                 f"delta must match the perturbed states, leaves of shape {want}, got {got}: "
                 "sample_delta(obs) draws one that does"
             )
-        parts = [x.reshape(*self.batch, -1) for x in leaves if x is not None]
+        parts = [x.reshape(*self.batch, -1) for x in given if x is not None]
         if not all(x.is_floating_point() for x in parts):
             raise TypeError(f"delta must be floating, got {[str(x.dtype) for x in parts]}")
         return torch.cat(parts, -1)
 
 
-def _scale(dtype: torch.dtype, obs_scale: float | None) -> float | None:
+def take_evenly(x: Tensor, fraction: float) -> Tensor:
+    """ceil(fraction · B) rows of x, `[B, ...]`, evenly spaced."""
+    size = x.shape[0]
+    count = math.ceil(fraction * size - 1e-9)  # 0.55 · 100 is 55.00000000000001
+    if count == size:
+        return x
+    return x[torch.arange(count, device=x.device) * size // count]
+
+
+def _check_shapes(shapes: list[tuple[int, ...]], batch_ndim: int) -> None:
+    batch = shapes[0][:batch_ndim]
+    if any(len(s) < batch_ndim or s[:batch_ndim] != batch for s in shapes):
+        raise ValueError(
+            f"obs needs batch_ndim={batch_ndim} leading axes that its leaves share, "
+            f"got shapes {shapes}"
+        )
+    if math.prod(batch) == 0:
+        raise ValueError(f"obs must not be empty, got shapes {shapes}")
+
+
+def _at_least_float32(x: Tensor) -> Tensor:
+    return x.float() if x.dtype in (torch.bfloat16, torch.float16) else x
+
+
+def _scale(dtype: torch.dtype, obs_scale: float | None) -> float:
     if dtype.is_floating_point:
         return 1.0
     if dtype == torch.bool:
-        return None
-    return IMAGE_SCALE if dtype == torch.uint8 and obs_scale is None else obs_scale
+        return 0.0
+    if obs_scale is None:
+        return IMAGE_SCALE if dtype == torch.uint8 else 0.0
+    return obs_scale
 
 
 def _is_finite(x: Tensor) -> bool:

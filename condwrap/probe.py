@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from condwrap.observation import take_evenly
 from condwrap.policy import Policy, flat_output
 from condwrap.regularizer import ConditioningRegularizer
 from condwrap.spectrum import jacobian_singular_values
@@ -77,7 +78,7 @@ class ConditioningProbe:
             `quotient_executed`, the median J of the executed action; with `log_spectrum` the
             singular values. What is not due is NaN, so that each update has the same names.
         """
-        states = self._subset(obs)
+        states = take_evenly(obs, self.fraction)
         delta = self.yardstick.sample_delta(states)
         measured = self.yardstick(policy, states, delta=delta)
         own = measured if self.own_is_paper else self.own(policy, states)
@@ -115,7 +116,7 @@ class ConditioningProbe:
             share = 0.0
             if self.own.coefficient > 0:
                 shared = list(policy.parameters() if parameters is None else parameters)
-                penalty = self.own(policy, self._subset(obs)).penalty
+                penalty = self.own(policy, take_evenly(obs, self.fraction)).penalty
                 share = (_gradient_norm(penalty, shared) / _gradient_norm(rest(), shared)).item()
         return {"conditioning/gradient_share": share}
 
@@ -127,12 +128,6 @@ class ConditioningProbe:
         """Restore what `state_dict` returned."""
         self.yardstick.load_state_dict(state_dict["yardstick"])
         self.own.load_state_dict(state_dict["own"])
-
-    def _subset(self, obs: Tensor) -> Tensor:
-        count = math.ceil(self.fraction * len(obs))
-        if count == len(obs):
-            return obs
-        return obs[torch.arange(count, device=obs.device) * len(obs) // count]
 
     def _executed(self, policy: Policy) -> Policy:
         """The policy's output, clipped as the environment clips an action."""

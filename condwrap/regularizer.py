@@ -11,7 +11,7 @@ from torch import Tensor
 
 from condwrap.estimators import ESTIMATORS
 from condwrap.functional import check_range, clamping_penalty, conditioning_quotient
-from condwrap.observation import States
+from condwrap.observation import States, take_evenly
 from condwrap.perturbation import Perturbation, get_perturbation
 from condwrap.policy import Policy, Select, check_reusable, check_select, flat_output
 
@@ -238,7 +238,7 @@ class ConditioningRegularizer:
     def _known(self, policy: Policy, output: Any, states: States) -> Tensor:
         check_reusable(policy)
         output = flat_output(output, self.select, states.batch, known=True)
-        return dataclasses.replace(states, leaves=[output]).subset(self.fraction).leaves[0]
+        return take_evenly(output, self.fraction)
 
     def _draw(self, states: States) -> Tensor:
         noise = torch.randn(

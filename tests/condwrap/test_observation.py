@@ -109,8 +109,8 @@ def test_delta_is_float64_for_float64_and_float32_otherwise(obs_dtype, dtype):
 def test_a_fraction_is_evenly_spaced(size, fraction, chosen):
     obs = {"x": torch.arange(size)[:, None].float(), "i": torch.arange(size)}
     subset = read(obs).subset(fraction)
-    assert subset.leaves[0].flatten().tolist() == chosen
-    assert subset.leaves[1].tolist() == chosen
+    assert subset.tensors[0].flatten().tolist() == chosen
+    assert subset.tensors[1].tolist() == chosen
 
 
 @pytest.mark.parametrize("percent", [7, 14, 28, 55, 56, 57])
@@ -188,4 +188,4 @@ def test_a_single_value_that_is_not_finite_is_refused(bad):
 
 def test_finite_observations_whose_sum_overflows_are_taken():
     huge = torch.full((4, 3), torch.finfo(torch.float32).max, requires_grad=True)
-    assert read(huge).leaves[0] is huge
+    assert read(huge).tensors[0] is huge
