@@ -58,6 +58,7 @@ def flat_output(output: Any, select: Select, batch: torch.Size, known: bool = Fa
         if output is None:
             raise ValueError("select returned None: it must return a tensor")
         select = "default"
+
     tensors = list(_tensors(output, select))
     if not tensors:
         raise ValueError(
@@ -79,6 +80,7 @@ def flat_output(output: Any, select: Select, batch: torch.Size, known: bool = Fa
                 f"output must be float32 at least, got {x.dtype}, whose rounding would pass for "
                 "sensitivity: leave output out"
             )
+
     # bf16 and fp16 differences would lose J to rounding
     wide = (x if x.dtype == torch.float64 else x.float() for x in tensors)
     return torch.cat(
@@ -106,17 +108,18 @@ def _tensors(output: Any, select: str) -> Iterator[Tensor]:
 
 def _parameter(distribution: td.Distribution, select: str) -> Tensor:
     base = distribution.base_dist if isinstance(distribution, td.Independent) else distribution
-    if select == "default":
-        select = (
-            "mean" if isinstance(base, _MEAN) else "logits" if isinstance(base, _LOGITS) else ""
-        )
+    if select == "default" and isinstance(base, _MEAN):
+        select = "mean"
+    if select == "default" and isinstance(base, _LOGITS):
+        select = "logits"
+
     try:
-        value = getattr(base, select, None) if select else None
+        value = getattr(base, select, None)
     except NotImplementedError:  # a mean that has no closed form
         value = None
     if value is None or (select == "mean" and isinstance(base, td.Categorical)):  # that is NaN
         raise TypeError(
-            f"no {select or 'default output'} for {type(base).__name__}: "
+            f"no {'default output' if select == 'default' else select} for {type(base).__name__}: "
             "pass select=lambda output: ... to select the tensor"
         )
     return value  # type: ignore[no-any-return]
@@ -189,20 +192,28 @@ def _reachable(policy: Any, depth: int = 2) -> Iterator[nn.Module]:
     """The modules a callable holds: itself, its owner's, or those that it closes over or names."""
     if isinstance(policy, nn.Module):
         yield policy
-    elif depth and not torch.compiler.is_compiling():  # dynamo cannot look into a function
-        if isinstance(policy, functools.partial):
-            depth += 1  # it only adds arguments
-            held = [policy.func, *policy.args, *policy.keywords.values()]
-        elif inspect.ismethod(policy):
-            held = [policy.__self__]
-        elif inspect.isfunction(policy):
-            names = policy.__code__.co_names
-            held = [policy.__globals__[name] for name in names if name in policy.__globals__]
-            for cell in policy.__closure__ or ():
-                with contextlib.suppress(ValueError):  # a cell that is not yet filled
-                    held.append(cell.cell_contents)
-        else:
-            held = list(getattr(policy, "__dict__", {}).values())
-        for item in held:
-            if not (isinstance(item, type) or inspect.ismodule(item)):
-                yield from _reachable(item, depth - 1)
+        return
+    if not depth or torch.compiler.is_compiling():  # dynamo cannot look into a function
+        return
+
+    below = depth if isinstance(policy, functools.partial) else depth - 1  # it only adds arguments
+    for item in _held(policy):
+        if not (isinstance(item, type) or inspect.ismodule(item)):
+            yield from _reachable(item, below)
+
+
+def _held(policy: Any) -> list[Any]:
+    """What a callable holds directly."""
+    if isinstance(policy, functools.partial):
+        return [policy.func, *policy.args, *policy.keywords.values()]
+    if inspect.ismethod(policy):
+        return [policy.__self__]
+    if not inspect.isfunction(policy):
+        return list(getattr(policy, "__dict__", {}).values())
+
+    names = policy.__code__.co_names
+    held = [policy.__globals__[name] for name in names if name in policy.__globals__]
+    for cell in policy.__closure__ or ():
+        with contextlib.suppress(ValueError):  # a cell that is not yet filled
+            held.append(cell.cell_contents)
+    return held
