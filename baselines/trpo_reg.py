@@ -2,9 +2,9 @@
 
     python trpo_reg.py --env-id HopperBulletEnv-v0 --seed 1
 
-Lines marked so are the conditioning penalty (Asadulaev et al., arXiv 1906.05437):  # condwrap
-`--coefficient 0` computes bit for bit what the file computes without them.  # condwrap
-They need condwrap installed, with its extras `baselines` and `bullet`.  # condwrap
+The lines marked as condwrap's add the conditioning penalty of Asadulaev et al. (arXiv 1906.05437).
+`--coefficient 0` computes bit for bit what the file computes without them. They need condwrap
+installed, and the file its extras `baselines` and `bullet`.
 
 A run's directory holds metrics.csv (a row for each update), TensorBoard events and checkpoint.pt;
 `--resume` continues a run as if it had never stopped.
@@ -15,6 +15,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import functools
+import json
 import math
 import os
 import signal
@@ -30,23 +31,31 @@ import torch
 import tyro
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 from gymnasium.wrappers.utils import RunningMeanStd
-from gymnasium.wrappers.vector import NormalizeReward, RecordEpisodeStatistics
+from gymnasium.wrappers.vector import ClipReward, NormalizeReward, RecordEpisodeStatistics
 from torch import Tensor, nn
 from torch.distributions import Independent, Normal, kl_divergence
 from torch.nn.utils import parameters_to_vector
 from torch.utils.tensorboard import SummaryWriter
 
-from condwrap import ConditioningRegularizer  # condwrap
-from condwrap.spectrum import jacobian_singular_values  # condwrap
-from condwrap.wrappers import VectorPerturbObservation  # condwrap
+from condwrap.settings import ConditioningArgs  # condwrap
+
+VERSION = 2  # raised whenever the numbers of a run change
+OBS_CLIP = 10.0  # bound of normalized observations
+MAY_CHANGE = {"run_dir", "resume", "extend", "track"}  # when a run is resumed
 
 
 class RunError(Exception):
     """A run that cannot start, and what to do."""
 
 
+class DivergedError(Exception):
+    """A run whose own numbers became non-finite: an outcome, not a failure of the machine."""
+
+
 @dataclasses.dataclass(frozen=True)
-class Args:
+class Args(
+    ConditioningArgs,  # condwrap
+):
     env_id: str = "HopperBulletEnv-v0"
     """any Gymnasium task with a Box of actions; "module:id" imports the module first"""
     seed: int = 1
@@ -59,10 +68,10 @@ class Args:
     """environments, stepped in turn"""
     num_steps: int = 2000
     """steps of each environment between two updates"""
-    num_minibatches: int = 16
-    """minibatches in an epoch of the critic: 16 of 2000 steps hold 125 each"""
+    num_minibatches: int = 40
+    """minibatches in an epoch of the critic: 40 of 2000 steps hold 50 each"""
     target_kl: float = 0.01
-    """bound on the mean KL divergence of a step"""
+    """delta_kl: bound on the mean KL divergence of a step"""
     cg_steps: int = 10
     """conjugate-gradient steps towards the natural gradient"""
     cg_damping: float = 0.1
@@ -70,65 +79,64 @@ class Args:
     line_search_steps: int = 10
     """fractions of the full step that are tried"""
     line_search_shrink: float = 0.8
-    """each fraction over the one before it"""
+    """each fraction over the one before it: 0.8 is sb3-contrib's, TRPO's paper names none"""
     vf_epochs: int = 10
     """passes over the rollout by the critic"""
-    vf_learning_rate: float = 1e-3
-    """Adam's step size for the critic"""
+    vf_learning_rate: float = 3e-4
+    """Adam's step size for the critic. The critic is that of ppo_reg.py, so that comparing the two
+    compares policies: 3e-4, 10 epochs, minibatches of about 64 (Schulman et al., 2017, Table 3)"""
     vf_coef: float = 0.5
-    """c2: factor of the critic's squared error"""
+    """c2: factor of the critic's squared error. Adam divides it out again: the critic feels c2 only
+    where the gradient is clipped"""
     gamma: float = 0.99
     """discount"""
     gae_lambda: float = 0.95
     """lambda of generalized advantage estimation"""
     max_grad_norm: float = 0.5
-    """length that the gradient of the critic is clipped to"""
+    """length that the critic's gradient is clipped to"""
     hidden_sizes: tuple[int, ...] = (64, 64)
     """widths of the hidden layers, of the policy and of the critic"""
     activation: Literal["tanh", "relu"] = "tanh"
     """what follows each hidden layer"""
+    output_gain: float = 0.01
+    """gain of the policy's orthogonal output layer; small ones start with actions near 0"""
     log_std_init: float = 0.0
     """log of the policy's standard deviation at the start"""
     norm_obs: bool = True
     """normalize observations by their running mean and variance, clipped to [-10, 10]"""
     norm_reward: bool = True
     """divide rewards, for learning only, by the running deviation of the discounted return"""
-    coefficient: float = 1e-3  # condwrap
-    """c1: factor of the conditioning penalty; 0 is plain TRPO, psi still measured"""  # condwrap
-    lambda_min: float = 1.0  # condwrap
-    """lower end of the range that J is kept in"""  # condwrap
-    lambda_max: float = 20.0  # condwrap
-    """upper end of the range that J is kept in"""  # condwrap
-    perturbation: str = "sphere"  # condwrap
-    """kind of delta: sphere, gaussian or uniform"""  # condwrap
-    radius: float = 1.0  # condwrap
-    """size of delta, in the normalized observations' units"""  # condwrap
-    perturb_obs: bool = False  # condwrap
-    """train on perturbed observations; with --coefficient 0, the penalty's rival"""  # condwrap
-    log_spectrum: int = 0  # condwrap
-    """updates between two logs of the Jacobian's singular values; 0: never"""  # condwrap
+    reward_clip: float = 10.0
+    """clip normalized rewards to [-reward_clip, reward_clip]; 0: do not clip"""
     run_dir: Path | None = None
     """where the run's files go; by default runs/<environment>__<this file>__s<seed>__a<agent>"""
     resume: bool = False
     """continue from the run directory's checkpoint, if it has one"""
+    extend: bool = False
+    """let a resumed run train for more timesteps than it was begun with"""
     checkpoint_interval: int = 50
     """updates between two checkpoints; the environments are rebuilt at each"""
-    capture_video: bool = False
-    """record episodes of the first environment (needs moviepy)"""
     track: bool = False
     """log to Weights & Biases too (needs wandb; WANDB_PROJECT names the project)"""
 
     def __post_init__(self) -> None:
-        for name, least in AT_LEAST.items():
-            values = getattr(self, name) if name == "hidden_sizes" else [getattr(self, name)]
-            if not all(value >= least for value in values):
-                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
-        for name in ("target_kl", "cg_damping", "vf_learning_rate", "max_grad_norm"):
+        counts = ("num_envs", "num_steps", "num_minibatches", "vf_epochs", "checkpoint_interval")
+        least = dict.fromkeys((*counts, "cg_steps", "line_search_steps"), 1)
+        for name, bound in {**least, "seed": 0, "agent": 0, "reward_clip": 0}.items():
+            if not getattr(self, name) >= bound:
+                raise ValueError(f"{name} must be at least {bound}, got {getattr(self, name)}")
+        if not all(size >= 1 for size in self.hidden_sizes):
+            raise ValueError(f"hidden_sizes must be at least 1, got {self.hidden_sizes}")
+
+        positive = ("target_kl", "cg_damping", "vf_learning_rate", "max_grad_norm", "output_gain")
+        for name in positive:
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be finite and above 0, got {getattr(self, name)}")
+
         for name in ("gamma", "gae_lambda", "line_search_shrink"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")
+
         batch = f"num_envs * num_steps = {self.batch_size}"
         if self.batch_size % self.num_minibatches or self.batch_size == self.num_minibatches:
             raise ValueError(
@@ -139,7 +147,7 @@ class Args:
             raise ValueError(
                 f"total_timesteps must be at least {batch}, got {self.total_timesteps}"
             )
-        self.regularizer(self.coefficient, seed=0)  # condwrap: its own checks
+        self.check_conditioning()  # condwrap
 
     @property
     def batch_size(self) -> int:
@@ -149,28 +157,10 @@ class Args:
     def num_updates(self) -> int:
         return self.total_timesteps // self.batch_size
 
-    def regularizer(self, coefficient: float, seed: int) -> ConditioningRegularizer:  # condwrap
-        sizes = {"perturbation": self.perturbation, "radius": self.radius}  # condwrap
-        lambdas = (self.lambda_min, self.lambda_max)  # condwrap
-        return ConditioningRegularizer(coefficient, *lambdas, **sizes, seed=seed)  # condwrap
-
     @property
     def path(self) -> Path:
         name = f"{self.env_id.split(':')[-1]}__{Path(__file__).stem}__s{self.seed}__a{self.agent}"
         return self.run_dir or Path("runs", name)
-
-
-AT_LEAST = {"seed": 0, "agent": 0, "num_envs": 1, "num_steps": 1, "num_minibatches": 1}
-AT_LEAST |= {
-    "cg_steps": 1,
-    "line_search_steps": 1,
-    "vf_epochs": 1,
-    "checkpoint_interval": 1,
-    "hidden_sizes": 1,
-}
-AT_LEAST |= {"log_spectrum": 0}  # condwrap
-CLIP = 10.0  # of normalized observations
-MAY_CHANGE = {"run_dir", "resume", "capture_video", "track"}  # when a run is resumed
 
 
 # --- environment ----------------------------------------------------------------------------------
@@ -187,17 +177,22 @@ class RunningMoments(RunningMeanStd):
 
 
 class NormalizeObservation(VectorWrapper):
-    """(obs - mean) / std by running statistics, clipped; `final_obs` too, unlike Gymnasium's own.
+    """(obs - mean) / std by running statistics, clipped, `final_obs` too.
 
-    The statistics are the caller's: they outlive the environments, and `update=False` freezes them.
+    Gymnasium's own raises where environments are reset in the same step. The statistics are the
+    caller's: they outlive the environments, and `update=False` freezes them.
     """
 
     def __init__(self, env: VectorEnv, rms: RunningMeanStd, update: bool = True) -> None:
         super().__init__(env)
-        self.rms, self.update = rms, update
-        box = gym.spaces.Box(-CLIP, CLIP, env.single_observation_space.shape, np.float32)
-        self.single_observation_space = box
-        self.observation_space = gym.vector.utils.batch_space(box, env.num_envs)
+        self.rms = rms
+        self.update = update
+
+        shape = env.single_observation_space.shape
+        self.single_observation_space = gym.spaces.Box(-OBS_CLIP, OBS_CLIP, shape, np.float32)
+        self.observation_space = gym.vector.utils.batch_space(
+            self.single_observation_space, env.num_envs
+        )
 
     def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict]:
         obs, info = self.env.reset(**kwargs)
@@ -216,40 +211,41 @@ class NormalizeObservation(VectorWrapper):
 
     def normalize(self, obs: np.ndarray) -> np.ndarray:
         scaled = (obs - self.rms.mean) / np.sqrt(self.rms.var + 1e-8)
-        return scaled.clip(-CLIP, CLIP).astype(np.float32)
+        return scaled.clip(-OBS_CLIP, OBS_CLIP).astype(np.float32)
 
 
-def make_env(args: Args, index: int, checkpoint: int) -> gym.Env:
+def make_env(args: Args) -> gym.Env:
     bullet = "Bullet" in args.env_id and ":" not in args.env_id
-    env_id = f"pybullet_envs_gymnasium:{args.env_id}" if bullet else args.env_id
-    video = args.capture_video and index == 0
-    env = gym.make(env_id, **({"render_mode": "rgb_array"} if video else {}))
+    env = gym.make(f"pybullet_envs_gymnasium:{args.env_id}" if bullet else args.env_id)
     if not isinstance(env.action_space, gym.spaces.Box):
         raise RunError(f"env_id must name a task with a Box of actions, got {env.action_space}")
-    if video:
-        folder, prefix = str(args.path / "videos"), f"checkpoint-{checkpoint}"
-        env = gym.wrappers.RecordVideo(env, folder, name_prefix=prefix)
+
     flat = len(env.observation_space.shape or ()) == 1
     return env if flat else gym.wrappers.FlattenObservation(env)
 
 
-def make_envs(args: Args, checkpoint: int, stats: dict[str, RunningMeanStd]) -> VectorEnv:
+def make_envs(args: Args, stats: dict[str, RunningMeanStd]) -> VectorEnv:
     """The environments until the next checkpoint, with `stats` to normalize by (filled if empty).
 
-    The state of a simulator cannot be saved. So every run builds its environments anew at each
-    scheduled checkpoint, and an interrupted run sees the same episodes as an undisturbed one.
+    The state of a simulator cannot be saved. So every run builds new environments at each scheduled
+    checkpoint, and an interrupted run sees the same episodes as an undisturbed one.
     """
-    makers = [functools.partial(make_env, args, i, checkpoint) for i in range(args.num_envs)]
+    makers = [functools.partial(make_env, args)] * args.num_envs
     envs: VectorEnv = SyncVectorEnv(makers, copy=False, autoreset_mode=AutoresetMode.SAME_STEP)
     envs = RecordEpisodeStatistics(envs)
+
     if args.norm_obs:
         shape = envs.single_observation_space.shape
         envs = NormalizeObservation(envs, stats.setdefault("obs_rms", RunningMoments(shape=shape)))
+
+    envs = args.perturb(envs)  # condwrap
+
     if args.norm_reward:
         envs = NormalizeReward(envs, gamma=args.gamma)
         envs.return_rms = stats.setdefault("return_rms", RunningMoments())
-    if args.perturb_obs:  # condwrap
-        envs = VectorPerturbObservation(envs, args.perturbation, args.radius)  # condwrap
+        if args.reward_clip:
+            envs = ClipReward(envs, -args.reward_clip, args.reward_clip)
+
     return envs
 
 
@@ -260,7 +256,6 @@ def env_seeds(args: Args, checkpoint: int) -> list[int]:
 
 # --- agent ----------------------------------------------------------------------------------------
 
-
 ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU}
 
 
@@ -269,10 +264,12 @@ def make_mlp(args: Args, n_in: int, n_out: int, gain: float, rng: torch.Generato
     layers: list[nn.Module] = []
     sizes = (n_in, *args.hidden_sizes, n_out)
     for i, size in enumerate(sizes[1:]):
+        is_output = i == len(sizes) - 2
         linear = nn.utils.skip_init(nn.Linear, sizes[i], size)
-        nn.init.orthogonal_(linear.weight, gain if i == len(sizes) - 2 else math.sqrt(2), rng)
+        nn.init.orthogonal_(linear.weight, gain if is_output else math.sqrt(2), rng)
         nn.init.zeros_(linear.bias)
         layers += [linear, ACTIVATIONS[args.activation]()]
+
     return nn.Sequential(*layers[:-1])
 
 
@@ -281,13 +278,69 @@ class Actor(nn.Module):
 
     def __init__(self, args: Args, obs_dim: int, action_dim: int, rng: torch.Generator) -> None:
         super().__init__()
-        self.mean = make_mlp(args, obs_dim, action_dim, 0.01, rng)
+        self.mean = make_mlp(args, obs_dim, action_dim, args.output_gain, rng)
         self.log_std = nn.Parameter(torch.full((action_dim,), args.log_std_init))
 
     def forward(self, obs: Tensor) -> Independent:
         mean = self.mean(obs)
         normal = Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False)
         return Independent(normal, 1, validate_args=False)
+
+
+class Learner:
+    """All that changes while training, and so all that a checkpoint holds."""
+
+    def __init__(self, args: Args) -> None:
+        self.stats: dict[str, RunningMeanStd] = {}
+        envs = make_envs(args, self.stats)
+        obs_dim = math.prod(envs.single_observation_space.shape)
+        action_dim = math.prod(envs.single_action_space.shape)
+        envs.close()
+
+        # each use of randomness has its own stream
+        names = ("init", "action", "minibatch", "penalty", "probe")
+        streams = np.random.SeedSequence((args.seed, args.agent)).spawn(len(names))
+        seeds = [int(stream.generate_state(1, np.uint64)[0]) for stream in streams]
+        self.generators = {
+            name: torch.Generator().manual_seed(seed)
+            for name, seed in zip(names[:3], seeds[:3], strict=True)
+        }
+
+        self.actor = Actor(args, obs_dim, action_dim, self.generators["init"])
+        self.critic = make_mlp(args, obs_dim, 1, 1.0, self.generators["init"])
+        adam = functools.partial(torch.optim.Adam, eps=1e-5, fused=True)
+        self.critic_optimizer = adam(self.critic.parameters(), args.vf_learning_rate)
+
+        self.regularizer = args.make_regularizer(seeds[3])  # condwrap
+        self.probe = args.make_probe(seeds[4], action_space=envs.single_action_space)  # condwrap
+        self.update = 0
+
+    @property
+    def weights(self) -> Tensor:
+        return parameters_to_vector([*self.actor.parameters(), *self.critic.parameters()])
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """What saves and restores its own state: networks, optimizers and the like."""
+        return {name: x for name, x in vars(self).items() if hasattr(x, "load_state_dict")}
+
+    def state_dict(self) -> dict[str, Any]:
+        state: dict[str, Any] = {name: part.state_dict() for name, part in self.parts.items()}
+        for name, rms in self.stats.items():
+            moments = vars(rms).items()
+            state[name] = {key: torch.tensor(x, dtype=torch.float64) for key, x in moments}
+
+        generators = {name: generator.get_state() for name, generator in self.generators.items()}
+        return {**state, "generators": generators, "update": self.update}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        for name, part in self.parts.items():
+            part.load_state_dict(state[name])
+        for name, rms in self.stats.items():
+            vars(rms).update({key: x.numpy() for key, x in state[name].items()})
+        for name, generator in self.generators.items():
+            generator.set_state(state["generators"][name])
+        self.update = state["update"]
 
 
 # --- TRPO -----------------------------------------------------------------------------------------
@@ -305,46 +358,127 @@ class Rollout(NamedTuple):
     next_obs: np.ndarray  # [N, obs_dim]
     returns: list[float]  # of the episodes that ended, in raw rewards
     lengths: list[int]
+    clean_obs: Tensor  # condwrap: [T · N, obs_dim], before they were perturbed
 
 
 @torch.no_grad()
 def rollout(args: Args, learner: Learner, envs: VectorEnv, next_obs: np.ndarray) -> Rollout:
     """Step the environments; autoreset is in the same step, so every transition counts."""
-    actor, critic, space = learner.actor, learner.critic, envs.single_action_space
+    actor = learner.actor
+    space = envs.single_action_space
     shape = (args.num_steps, envs.num_envs)
-    obs, after = (np.empty((*shape, next_obs.shape[-1]), np.float32) for _ in range(2))
-    rewards, ends, dones = (np.empty(shape, np.float32) for _ in range(3))
-    noise = torch.randn((*shape, len(actor.log_std)), generator=learner.generators["action"])
-    actions = noise * actor.log_std.exp()
+    obs = np.empty((*shape, next_obs.shape[-1]), np.float32)
+    after = np.empty_like(obs)
+    clean_obs = np.empty_like(obs)  # condwrap
+    rewards = np.empty(shape, np.float32)
+    ends = np.empty(shape, np.float32)
+    dones = np.empty(shape, np.float32)
     returns: list[float] = []
     lengths: list[int] = []
+
+    # a_t = mean(s_t) + std · noise_t, the noise of all steps drawn at once
+    noise = torch.randn((*shape, len(actor.log_std)), generator=learner.generators["action"])
+    actions = noise * actor.log_std.exp()
+
     for t in range(args.num_steps):
         obs[t] = next_obs
+        clean_obs[t] = envs.clean_obs if args.perturb_obs else next_obs  # condwrap
         actions[t] += actor.mean(torch.from_numpy(obs[t]))
-        action = actions[t].numpy().reshape(-1, *space.shape)
-        next_obs, rewards[t], ends[t], cut, info = envs.step(action.clip(space.low, space.high))
-        after[t], dones[t] = next_obs, np.maximum(ends[t], cut)
+
+        # the environment executes the action clipped to its space
+        action = actions[t].numpy().reshape(-1, *space.shape).clip(space.low, space.high)
+        next_obs, rewards[t], ends[t], cuts, info = envs.step(action)
+        dones[t] = np.maximum(ends[t], cuts)
+
+        # what the step led to is the last observation of the episode, not the first of the next
+        after[t] = next_obs
         for i in np.flatnonzero(dones[t]):
             after[t, i] = info["final_obs"][i]
         if "episode" in info:
             returns += info["episode"]["r"][info["_episode"]].tolist()
             lengths += info["episode"]["l"][info["_episode"]].tolist()
-    obs, after, rewards, ends, dones = map(torch.from_numpy, (obs, after, rewards, ends, dones))
-    values, next_values = critic(obs).squeeze(-1), critic(after).squeeze(-1) * (1 - ends)
-    return Rollout(obs, actions, rewards, dones, values, next_values, next_obs, returns, lengths)
+
+    values = learner.critic(torch.from_numpy(obs)).squeeze(-1)
+    next_values = learner.critic(torch.from_numpy(after)).squeeze(-1)
+    return Rollout(
+        obs=torch.from_numpy(obs),
+        actions=actions,
+        rewards=torch.from_numpy(rewards),
+        dones=torch.from_numpy(dones),
+        values=values,
+        next_values=next_values * (1 - torch.from_numpy(ends)),
+        next_obs=next_obs,
+        returns=returns,
+        lengths=lengths,
+        clean_obs=torch.from_numpy(clean_obs).flatten(0, 1),  # condwrap
+    )
 
 
 def gae(data: Rollout, gamma: float, gae_lambda: float) -> Tensor:
-    """Generalized advantage estimation (Schulman et al., 2016, arXiv 1506.02438), `[T, N]`.
-
-    A_t = d_t + gamma · lambda · (1 - done_t) · A_{t+1},  d_t = r_t + gamma · next_value_t - V_t
-    """
+    """Generalized advantage estimation (Schulman et al., 2016, arXiv 1506.02438), `[T, N]`."""
+    # TD error: d_t = r_t + gamma · V(s_{t+1}) - V(s_t)
     errors = (data.rewards + gamma * data.next_values - data.values).numpy()
     decays = (gamma * gae_lambda * (1 - data.dones)).numpy()
-    advantages, advantage = np.empty_like(errors), np.zeros_like(errors[0])
+
+    # A_t = d_t + gamma · lambda · (1 - done_t) · A_{t+1}
+    advantages = np.empty_like(errors)
+    advantage = np.zeros_like(errors[0])
     for t in reversed(range(len(errors))):
-        advantages[t] = advantage = errors[t] + decays[t] * advantage
+        advantage = errors[t] + decays[t] * advantage
+        advantages[t] = advantage
+
     return torch.from_numpy(advantages)
+
+
+def surrogate(
+    learner: Learner,
+    obs: Tensor,
+    actions: Tensor,
+    old_logprobs: Tensor,
+    advantages: Tensor,
+    delta: Tensor | None = None,  # condwrap
+) -> Tensor:
+    """What a step maximizes, over the whole rollout."""
+    actor = learner.actor
+    policy = actor(obs)
+
+    # E[ratio · A]
+    ratio = (policy.log_prob(actions) - old_logprobs).exp()
+    objective = (ratio * advantages).mean()
+
+    # E[ratio · A] - c1 · mean(psi)
+    if delta is not None:  # condwrap
+        penalty = learner.regularizer(actor, obs, delta=delta, output=policy).penalty  # condwrap
+        objective -= penalty  # condwrap
+    return objective
+
+
+def flat_grad(value: Tensor, parameters: list[nn.Parameter], **kwargs: bool) -> Tensor:
+    return torch.cat([g.flatten() for g in torch.autograd.grad(value, parameters, **kwargs)])
+
+
+def set_parameters(parameters: list[nn.Parameter], vector: Tensor) -> None:
+    """Copy the vector's parts into the parameters.
+
+    `vector_to_parameters` would make them views into it. These are aligned otherwise than what a
+    checkpoint loads and so round otherwise, and a resumed run would not be the same.
+    """
+    parts = vector.split([p.numel() for p in parameters])
+    for parameter, part in zip(parameters, parts, strict=True):
+        parameter.data.copy_(part.view_as(parameter))
+
+
+def fisher_product(
+    kl: Tensor, parameters: list[nn.Parameter], damping: float
+) -> Callable[[Tensor], Tensor]:
+    """The map v -> (F + damping · I) v, F the Hessian of the mean KL divergence: never built."""
+    gradient = flat_grad(kl, parameters, create_graph=True)
+
+    def product(v: Tensor) -> Tensor:
+        # F v = gradient of (gradient of KL · v)
+        return flat_grad(gradient @ v, parameters, retain_graph=True) + damping * v
+
+    return product
 
 
 def conjugate_gradient(
@@ -355,80 +489,94 @@ def conjugate_gradient(
     Hestenes and Stiefel (1952). Ends after `steps`, once ‖b - A x‖² <= tolerance · ‖b‖², or where
     the curvature pᵀ A p is not above 0, with the x found so far. Returns x and ‖b - A x‖ / ‖b‖.
     """
-    x, residual, direction = torch.zeros_like(b), b.clone(), b.clone()
-    squared = start = residual @ residual
+    x = torch.zeros_like(b)
+    residual = b.clone()
+    direction = b.clone()
+    start = b @ b
+    squared = start
     for _ in range(steps):
         if squared <= tolerance * start:
             break
+
+        # x += alpha · p, with alpha = rᵀ r / pᵀ A p
         image = product(direction)
         curvature = direction @ image
         if not curvature > 0:  # NaN too
             break
-        size = squared / curvature
-        x += size * direction
-        residual -= size * image
-        squared, before = residual @ residual, squared
-        direction = residual + (squared / before) * direction
+        alpha = squared / curvature
+        x += alpha * direction
+        residual -= alpha * image
+
+        # p = r + beta · p, with beta = new rᵀ r / old rᵀ r
+        beta = residual @ residual / squared
+        squared = residual @ residual
+        direction = residual + beta * direction
+
     return x, (squared / start).sqrt().item() if start else 0.0
 
 
-def fisher_product(kl: Tensor, parameters: list[nn.Parameter], damping: float) -> Any:
-    """The map v -> (F + damping · I) v, F the Hessian of the mean KL divergence: never built."""
-    gradient = flat_grad(kl, parameters, create_graph=True)
-    return lambda v: flat_grad(gradient @ v, parameters, retain_graph=True) + damping * v
+def line_search(
+    args: Args,
+    parameters: list[nn.Parameter],
+    full_step: Tensor,
+    before: Tensor,
+    objective: Callable[[], Tensor],
+    mean_kl: Callable[[], Tensor],
+) -> dict[str, float]:
+    """Take the first fraction of the full step that is accepted, or none; what is logged of it."""
+    old = parameters_to_vector(parameters).detach().clone()
+    for i in range(args.line_search_steps):
+        fraction = args.line_search_shrink**i
+        set_parameters(parameters, old + fraction * full_step)
+        with torch.no_grad():
+            gain = (objective() - before).item()
+            kl = mean_kl().item()
 
+        # accepted: KL(old‖new) <= delta_kl, and the objective improves
+        if kl <= args.target_kl and 0 < gain < math.inf:
+            return {
+                "kl": kl,
+                "step_fraction": fraction,
+                "accepted": 1.0,
+                "actual_improvement": gain,
+            }
 
-def flat_grad(value: Tensor, parameters: list[nn.Parameter], **kwargs: bool) -> Tensor:
-    return torch.cat([g.flatten() for g in torch.autograd.grad(value, parameters, **kwargs)])
-
-
-def set_parameters(parameters: list[nn.Parameter], vector: Tensor) -> None:
-    """Copy the vector in. Views into it (`vector_to_parameters`) round otherwise than what a
-    checkpoint loads, since they are aligned otherwise, and a resumed run would not be the same.
-    """
-    parts = vector.split([p.numel() for p in parameters])
-    for parameter, part in zip(parameters, parts, strict=True):
-        parameter.data.copy_(part.view_as(parameter))
+    set_parameters(parameters, old)
+    print("step rejected: no fraction of it improves the objective within the KL bound")
+    return {}
 
 
 def natural_step(
     args: Args, actor: Actor, objective: Callable[[], Tensor], mean_kl: Callable[[], Tensor]
 ) -> dict[str, float]:
-    """One step up the objective within the KL bound, or none.
+    """One step up the objective within the KL bound; what is logged of it.
 
-    The direction is that of the natural gradient, F⁻¹ g; its full length is the one at which the
-    quadratic model of the KL divergence meets the bound. Backtracking accepts the first fraction
-    that keeps the KL divergence within the bound and improves the objective; where none does, or
-    where a number is not finite or the curvature not positive, the old policy stays.
+    The old policy stays where a number is not finite, the curvature is not positive, or no fraction
+    of the full step is accepted.
     """
     parameters = list(actor.parameters())
-    old = parameters_to_vector(parameters).detach().clone()
-    before = objective()
-    gradient = flat_grad(before, parameters)
     names = ("kl", "step_fraction", "cg_residual", "accepted")
     logs = dict.fromkeys((*names, "expected_improvement", "actual_improvement"), 0.0)
+
+    # g = gradient of the objective
+    before = objective()
+    gradient = flat_grad(before, parameters)
     if not gradient.isfinite().all() or not gradient.any():
-        print(f"step rejected: the gradient is {'0' if not gradient.any() else 'not finite'}")
+        print(f"step rejected: the gradient is {'not finite' if gradient.any() else '0'}")
         return logs
+
+    # natural gradient: x = F⁻¹ g, with F damped
     product = fisher_product(mean_kl(), parameters, args.cg_damping)
-    direction, logs["cg_residual"] = conjugate_gradient(product, gradient, args.cg_steps)
-    curvature = direction @ product(direction)
-    full_step = (2 * args.target_kl / curvature).sqrt() * direction
+    x, logs["cg_residual"] = conjugate_gradient(product, gradient, args.cg_steps)
+
+    # full step: sqrt(2 · delta_kl / xᵀ F x) · x, where the quadratic model of KL meets delta_kl
+    full_step = (2 * args.target_kl / (x @ product(x))).sqrt() * x
     if not full_step.isfinite().all():
         print("step rejected: no positive curvature")
         return logs
     logs["expected_improvement"] = (gradient @ full_step).item()
-    for i in range(args.line_search_steps):
-        fraction = args.line_search_shrink**i
-        set_parameters(parameters, old + fraction * full_step)
-        with torch.no_grad():
-            gain, kl = (objective() - before).item(), mean_kl().item()
-        if kl <= args.target_kl and 0 < gain < math.inf:
-            return logs | {"kl": kl, "step_fraction": fraction, "accepted": 1.0,
-                           "actual_improvement": gain}  # fmt: skip
-    set_parameters(parameters, old)
-    print("step rejected: no fraction of it improves the objective within the KL bound")
-    return logs
+
+    return {**logs, **line_search(args, parameters, full_step, before, objective, mean_kl)}
 
 
 def step(optimizer: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float) -> None:
@@ -441,11 +589,14 @@ def step(optimizer: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float) -
 def update(args: Args, learner: Learner, data: Rollout) -> dict[str, float]:
     """One natural-gradient step of the policy over one rollout, then the critic's epochs.
 
-    Maximized is the surrogate E[ratio · A] - c1 · mean(psi), psi over the whole rollout. Its delta
-    is held fixed through the gradient and the line search, which so see one function.
+    The penalty is part of what the step maximizes, E[ratio · A] - c1 · mean(psi). Its delta stays
+    the same through the gradient and the line search, which so see one function.
     """
-    actor, critic = learner.actor, learner.critic
-    obs, actions = data.obs.flatten(0, 1), data.actions.flatten(0, 1)
+    actor = learner.actor
+
+    # flatten [T, N, ...] to [T · N, ...]; the critic's targets are A_t + V(s_t)
+    obs = data.obs.flatten(0, 1)
+    actions = data.actions.flatten(0, 1)
     advantages = gae(data, args.gamma, args.gae_lambda).flatten()
     values = data.values.flatten()
     targets = advantages + values
@@ -453,110 +604,48 @@ def update(args: Args, learner: Learner, data: Rollout) -> dict[str, float]:
     with torch.no_grad():
         old_policy = actor(obs)
         old_logprobs = old_policy.log_prob(actions)
-    if args.coefficient > 0:  # condwrap
-        delta = learner.regularizer.sample_delta(obs)  # condwrap
+    batch = [obs, actions, old_logprobs, advantages]
 
-    def objective() -> Tensor:
-        policy = actor(obs)
-        surrogate = ((policy.log_prob(actions) - old_logprobs).exp() * advantages).mean()
-        if args.coefficient > 0:  # condwrap
-            measured = learner.regularizer(actor, obs, delta=delta, output=policy)  # condwrap
-            surrogate = surrogate - measured.penalty  # condwrap
-        return surrogate
+    plain = functools.partial(surrogate, learner, *batch)  # condwrap
+    share = learner.probe.gradient_share(learner.update, actor, obs, plain)  # condwrap
+    if args.coefficient > 0:  # condwrap
+        batch.append(learner.regularizer.sample_delta(obs))  # condwrap
 
     def mean_kl() -> Tensor:
         return kl_divergence(old_policy, actor(obs)).mean()
 
-    logs = natural_step(args, actor, objective, mean_kl)
-    value_losses = []
+    logs = natural_step(args, actor, functools.partial(surrogate, learner, *batch), mean_kl)
+
+    # L_VF = E[(V(s_t) - target_t)²]
+    value_losses: list[Tensor] = []
     for _ in range(args.vf_epochs):
         order = torch.randperm(len(obs), generator=learner.generators["minibatch"])
         for i in order.split(len(obs) // args.num_minibatches):
-            value_loss = (critic(obs[i]).squeeze(-1) - targets[i]).square().mean()
+            value_loss = (learner.critic(obs[i]).squeeze(-1) - targets[i]).square().mean()
             step(learner.critic_optimizer, args.vf_coef * value_loss, args.max_grad_norm)
             value_losses.append(value_loss.detach())
-    logs["value_loss"] = torch.stack(value_losses).mean().item()
-    logs["entropy"] = old_policy.entropy().mean().item()
-    logs["explained_variance"] = (1 - (targets - values).var() / targets.var()).item()
-    return {f"losses/{name}": value for name, value in logs.items()}
+
+    return {
+        **{f"losses/{name}": value for name, value in logs.items()},
+        "losses/value_loss": torch.stack(value_losses).mean().item(),
+        "losses/entropy": old_policy.entropy().mean().item(),
+        "losses/explained_variance": (1 - (targets - values).var() / targets.var()).item(),
+        **share,  # condwrap
+    }
 
 
-def measure_conditioning(args: Args, learner: Learner, obs: Tensor) -> dict[str, float]:  # condwrap
-    """How the new policy is conditioned on the whole rollout: one rule in every run."""  # condwrap
-    obs = obs.flatten(0, 1)  # condwrap
-    measured = learner.probe(learner.actor, obs)  # condwrap
-    q05, q50, q95 = measured.quotient.quantile(torch.tensor([0.05, 0.5, 0.95]))  # condwrap
-    logs = {"psi": measured.psi.mean(), "quotient_q05": q05, "quotient_q50": q50}  # condwrap
-    logs |= {"quotient_q95": q95, "fraction_below": measured.fraction_below}  # condwrap
-    logs["fraction_above"] = measured.fraction_above  # condwrap
-    if args.log_spectrum:  # condwrap
-        values = torch.full((1, 1), math.nan)  # condwrap
-        if learner.update % args.log_spectrum == 0:  # condwrap
-            with torch.no_grad():  # condwrap
-                values = jacobian_singular_values(learner.actor, obs)  # condwrap
-        logs["singular_value_max"] = values[:, 0].mean()  # condwrap
-        logs["singular_value_mean"] = values.mean()  # condwrap
-        logs["squared_singular_value"] = values.square().mean()  # condwrap
-        logs["condition_number"] = (values[:, 0] / values[:, -1]).median()  # condwrap
-    return {f"conditioning/{name}": x.item() for name, x in logs.items()}  # condwrap
-
-
-# --- state and files ------------------------------------------------------------------------------
-
-
-class Learner:
-    """All that changes while training, and so all that a checkpoint holds."""
-
-    def __init__(self, args: Args) -> None:
-        self.stats: dict[str, RunningMeanStd] = {}
-        envs = make_envs(dataclasses.replace(args, capture_video=False), 0, self.stats)
-        obs_dim = math.prod(envs.single_observation_space.shape)
-        action_dim = math.prod(envs.single_action_space.shape)
-        envs.close()
-        names = ("init", "action", "minibatch", "penalty", "probe")  # each use has its own stream
-        streams = np.random.SeedSequence((args.seed, args.agent)).spawn(len(names))
-        seeds = {
-            n: int(s.generate_state(1, np.uint64)[0]) for n, s in zip(names, streams, strict=True)
-        }
-        self.generators = {n: torch.Generator().manual_seed(seeds[n]) for n in names[:3]}
-        self.actor = Actor(args, obs_dim, action_dim, self.generators["init"])
-        self.critic = make_mlp(args, obs_dim, 1, 1.0, self.generators["init"])
-        adam = functools.partial(torch.optim.Adam, eps=1e-5, fused=True)
-        self.critic_optimizer = adam(self.critic.parameters(), args.vf_learning_rate)
-        self.regularizer = args.regularizer(args.coefficient, seeds["penalty"])  # condwrap
-        self.probe = args.regularizer(0.0, seeds["probe"])  # condwrap
-        self.update = 0
-
-    def state_dict(self) -> dict[str, Any]:
-        state: dict[str, Any] = {name: getattr(self, name).state_dict() for name in TRAINED}
-        for name, rms in self.stats.items():
-            moments = vars(rms).items()
-            state[name] = {key: torch.tensor(x, dtype=torch.float64) for key, x in moments}
-        generators = {name: generator.get_state() for name, generator in self.generators.items()}
-        return {**state, "generators": generators, "update": self.update}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        for name in TRAINED:
-            getattr(self, name).load_state_dict(state[name])
-        for name, rms in self.stats.items():
-            vars(rms).update({key: x.numpy() for key, x in state[name].items()})
-        for name, generator in self.generators.items():
-            generator.set_state(state["generators"][name])
-        self.update = state["update"]
-
-
-TRAINED = ("actor", "critic", "critic_optimizer")
-TRAINED += ("regularizer", "probe")  # condwrap
+# --- files ----------------------------------------------------------------------------------------
 
 
 def open_logs(args: Args, saved: dict[str, Any] | None) -> SummaryWriter:
     """Cut metrics.csv back to the checkpoint, and go on with TensorBoard's events from there."""
     args.path.mkdir(parents=True, exist_ok=True)
+    size = saved["metrics_size"] if saved else 0
     with open(args.path / "metrics.csv", "a") as metrics:
-        size = saved["metrics_size"] if saved else 0
         if metrics.tell() < size:
-            raise RunError(f"{metrics.name} lacks rows: remove its folder to start anew")
+            raise RunError(f"{metrics.name} lacks rows: remove its folder to start again")
         metrics.truncate(size)  # later rows are computed again
+
     first = saved["learner"]["update"] if saved else 0
     writer = SummaryWriter(str(args.path), purge_step=first * args.batch_size + 1)
     rows = "".join(f"\n|{name}|{value}|" for name, value in vars(args).items())
@@ -572,9 +661,10 @@ def make_row(
         "global_step": learner.update * args.batch_size,
         "charts/episodic_return": float(np.mean(data.returns or math.nan)),
         "charts/episodic_length": float(np.mean(data.lengths or math.nan)),
+        "charts/episodes": len(data.returns),
         "charts/SPS": speed,
         **losses,
-        **measure_conditioning(args, learner, data.obs),  # condwrap
+        **learner.probe.measure(learner.update, learner.actor, data.clean_obs),  # condwrap
     }
 
 
@@ -585,6 +675,7 @@ def write_metrics(args: Args, writer: SummaryWriter, row: dict[str, float]) -> N
         if file.tell() == 0:
             table.writeheader()
         table.writerow(row)
+
     for name, value in row.items():
         if not math.isnan(value):
             writer.add_scalar(name, value, int(row["global_step"]))
@@ -595,12 +686,15 @@ def save_checkpoint(args: Args, learner: Learner) -> None:
     with open(args.path / "metrics.csv", "rb") as metrics:
         os.fsync(metrics.fileno())
         size = os.fstat(metrics.fileno()).st_size
+
     settings = {k: v for k, v in vars(args).items() if k not in MAY_CHANGE}
+    content = {"args": settings, "learner": learner.state_dict(), "metrics_size": size}
     path = args.path / "checkpoint.pt"
     with open(path.with_suffix(".tmp"), "wb") as file:
-        torch.save({"args": settings, "learner": learner.state_dict(), "metrics_size": size}, file)
+        torch.save(content, file)
         file.flush()
         os.fsync(file.fileno())
+
     if path.exists():
         path.replace(path.with_suffix(".previous.pt"))
     path.with_suffix(".tmp").replace(path)
@@ -612,23 +706,50 @@ def load_checkpoint(args: Args) -> dict[str, Any] | None:
     found = [p for p in (path, path.with_suffix(".previous.pt")) if p.exists()]
     if not args.resume and (found or (args.path / "metrics.csv").exists()):
         raise RunError(f"{args.path} holds a run: --resume it, or name another --run-dir")
+
     for candidate in found:
         try:
             saved = torch.load(candidate, map_location="cpu", weights_only=True)
         except Exception as error:  # whatever a torn file makes the reader stumble over
             print(f"{candidate} cannot be read: {error!r}")
             continue
-        for name, value in saved["args"].items():
-            now = getattr(args, name, None)
-            if value != now:
-                raise RunError(f"{args.path} was run with {name}={value}, not {now}")
+        check_same(args, saved)
         return saved
+
     if found:
-        raise RunError(f"{args.path} holds no readable checkpoint: remove it to start anew")
+        raise RunError(f"{args.path} holds no readable checkpoint: remove it to start again")
     return None
 
 
-# --- training ------------------------------------------------------------------------------------
+def check_same(args: Args, saved: dict[str, Any]) -> None:
+    """Raise RunError unless the run was begun with these arguments, or can be extended to them."""
+    longer = args.extend and args.total_timesteps > saved["args"]["total_timesteps"]
+    for name, value in saved["args"].items():
+        now = getattr(args, name, None)
+        if value != now and not (longer and name == "total_timesteps"):
+            raise RunError(f"{args.path} was run with {name}={value}, not {now}")
+
+    if longer and getattr(args, "anneal_lr", False):
+        raise RunError("a run with --anneal-lr depends on its length: it cannot be extended")
+    update = saved["learner"]["update"]
+    if longer and update % args.checkpoint_interval:
+        raise RunError(
+            f"{args.path} cannot be extended: its {update} updates are not a multiple of "
+            f"checkpoint_interval={args.checkpoint_interval}, at which environments are rebuilt"
+        )
+
+
+# --- training -------------------------------------------------------------------------------------
+
+
+def check_finite(args: Args, update: int, **numbers: Tensor) -> None:
+    """Raise DivergedError, and say so in diverged.json, for the first that is not finite."""
+    for what, values in numbers.items():
+        if not values.isfinite().all():
+            message = f"the {what} became non-finite in update {update}"
+            content = {"update": update, "what": what, "message": message}
+            (args.path / "diverged.json").write_text(json.dumps(content))
+            raise DivergedError(f"{args.path}: {message}")
 
 
 def train(args: Args) -> Learner:
@@ -637,28 +758,39 @@ def train(args: Args) -> Learner:
     learner = Learner(args)
     if saved:
         learner.load_state_dict(saved["learner"])
-    if learner.update == args.num_updates:
+    if learner.update >= args.num_updates:
         print(f"{args.path} is finished")
         return learner
+
     writer = open_logs(args, saved)
-    first, started, printed = learner.update, time.time(), -math.inf
+    first = learner.update
+    started = time.monotonic()
+    printed = -math.inf
     while learner.update < args.num_updates:  # from one checkpoint to the next
         checkpoint = learner.update // args.checkpoint_interval
-        envs = make_envs(args, checkpoint, learner.stats)
+        envs = make_envs(args, learner.stats)
         next_obs, _ = envs.reset(seed=env_seeds(args, checkpoint))
+
         for _ in range(min(args.checkpoint_interval, args.num_updates - learner.update)):
             data = rollout(args, learner, envs, next_obs)
-            next_obs, losses = data.next_obs, update(args, learner, data)
+            next_obs = data.next_obs
             learner.update += 1
-            speed = (learner.update - first) * args.batch_size / (time.time() - started)
+            check_finite(args, learner.update, observation=data.obs, reward=data.rewards)
+            losses = update(args, learner, data)
+            check_finite(args, learner.update, loss=learner.weights)
+
+            now = time.monotonic()
+            speed = (learner.update - first) * args.batch_size / (now - started)
             row = make_row(args, learner, data, losses, speed)
             write_metrics(args, writer, row)
-            if time.time() - printed > 10 or learner.update == args.num_updates:
-                printed = time.time()
+            if now - printed > 10 or learner.update == args.num_updates:
+                printed = now
                 print(f"update {learner.update}/{args.num_updates}  {speed:.0f} steps/s  "
                       f"return {row['charts/episodic_return']:.1f}")  # fmt: skip
+
         envs.close()
         save_checkpoint(args, learner)
+
     writer.close()
     return learner
 
@@ -668,6 +800,7 @@ def main() -> None:
     sys.stdout.reconfigure(line_buffering=True)  # progress shows in a log file too
     for stop in (signal.SIGTERM, signal.SIGINT):  # a background job may begin with SIGINT ignored
         signal.signal(stop, signal.default_int_handler)
+
     try:
         args = tyro.cli(Args, description=__doc__)
         if args.track:
@@ -675,6 +808,9 @@ def main() -> None:
 
             wandb.init(name=args.path.name, config=vars(args), sync_tensorboard=True)
         train(args)
+    except DivergedError as error:
+        print(error)
+        sys.exit(3)
     except (RunError, gym.error.Error, ModuleNotFoundError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
