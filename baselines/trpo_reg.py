@@ -523,7 +523,7 @@ def line_search(
     objective: Callable[[], Tensor],
     mean_kl: Callable[[], Tensor],
 ) -> dict[str, float]:
-    """Take the first fraction of the full step that is accepted, or none; what is logged of it."""
+    """Take the first fraction of the full step that is accepted; its logs, or {} if none is."""
     old = parameters_to_vector(parameters).detach().clone()
     for i in range(args.line_search_steps):
         fraction = args.line_search_shrink**i
@@ -542,7 +542,6 @@ def line_search(
             }
 
     set_parameters(parameters, old)
-    print("step rejected: no fraction of it improves the objective within the KL bound")
     return {}
 
 
@@ -576,7 +575,10 @@ def natural_step(
         return logs
     logs["expected_improvement"] = (gradient @ full_step).item()
 
-    return {**logs, **line_search(args, parameters, full_step, before, objective, mean_kl)}
+    accepted = line_search(args, parameters, full_step, before, objective, mean_kl)
+    if not accepted:
+        print("step rejected: no fraction of it improves the objective within the KL bound")
+    return {**logs, **accepted}
 
 
 def step(optimizer: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float) -> None:

@@ -37,7 +37,7 @@ def recorded(args, dtype: torch.dtype = torch.float32) -> tuple[list, list]:
     """Each agent's learner and a rollout of its own, by the single file."""
     single, learners, rollouts = args.single, learners_of(args), []
     for run, learner in zip(args.runs, learners, strict=True):
-        envs = single.make_envs(run, 0, learner.stats)
+        envs = single.make_envs(run, learner.stats)
         next_obs, _ = envs.reset(seed=single.env_seeds(run, 0))
         data = single.rollout(run, learner, envs, next_obs)
         envs.close()

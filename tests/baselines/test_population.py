@@ -45,9 +45,9 @@ def test_what_agents_see_is_what_the_wrappers_would_show_bit_for_bit(env_id, num
     )
     learners, alone = learners_of(args), learners_of(args)
     for checkpoint in range(2):  # the second goes on with the statistics of the first
-        ours = population.make_envs(args, checkpoint, learners)
+        ours = population.make_envs(args, learners)
         theirs = [
-            args.single.make_envs(run, checkpoint, x.stats)
+            args.single.make_envs(run, x.stats)
             for run, x in zip(args.runs, alone, strict=True)
         ]
         obs, _ = ours.reset(seed=seeds_of(args, checkpoint))
@@ -94,13 +94,13 @@ def test_the_agents_begin_as_their_single_selves_and_go_through_the_same_noise(m
     learners, alone = learners_of(args), learners_of(args)
     for learner in (*learners, *alone):
         torch.nn.init.zeros_(learner.actor.mean[-1].weight)  # so that actions are noise alone
-    envs = population.make_envs(args, 0, learners)
+    envs = population.make_envs(args, learners)
     next_obs, _ = envs.reset(seed=seeds_of(args))
     for _ in range(2):
         rollouts = population.rollout(args, learners, envs, next_obs)
         next_obs = np.concatenate([r.next_obs for r in rollouts])
     for i, (run, learner) in enumerate(zip(args.runs, alone, strict=True)):
-        theirs = args.single.make_envs(run, 0, learner.stats)
+        theirs = args.single.make_envs(run, learner.stats)
         next_obs, _ = theirs.reset(seed=args.single.env_seeds(run, 0))
         for _ in range(2):
             data = args.single.rollout(run, learner, theirs, next_obs)
@@ -122,7 +122,7 @@ def test_the_agents_begin_as_their_single_selves_and_go_through_the_same_noise(m
 def test_actions_are_those_of_each_agents_own_policy(module):
     args = arguments(module, env_id="test/Drift-v0")
     learners, alone = learners_of(args), learners_of(args)
-    envs = population.make_envs(args, 0, learners)
+    envs = population.make_envs(args, learners)
     next_obs, _ = envs.reset(seed=seeds_of(args))
     rollouts = population.rollout(args, learners, envs, next_obs)
     for data, learner in zip(rollouts, alone, strict=True):
