@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
 import shutil
 import subprocess
@@ -15,7 +16,14 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from baselines import population, ppo_reg_population
-from tests.baselines.helpers import FLAGS, check_refusal, name, read_metrics, without_speed
+from tests.baselines.helpers import (
+    FLAGS,
+    check_refusal,
+    interrupted,
+    name,
+    read_metrics,
+    without_speed,
+)
 from tests.baselines.population_helpers import (
     POPULATIONS,
     arguments,
@@ -145,9 +153,10 @@ RESUMABLE = {"checkpoint_interval": 2, "total_timesteps": 7 * 64}
 def interrupt(module, args, monkeypatch, at_update: int) -> None:
     """Train until Ctrl-C comes in the middle of an update."""
     update = module.update
+    calls = itertools.count()
 
     def stop(args, learners, rollouts):
-        if learners[0].update == at_update:
+        if next(calls) == at_update:
             raise KeyboardInterrupt
         return update(args, learners, rollouts)
 
@@ -242,19 +251,9 @@ def test_either_program_goes_on_where_the_other_was_stopped(module, tmp_path, mo
     )
     single = single_of(module)
     undisturbed = [single.train(run) for run in whole.runs]
-    update = single.update
-
-    def stop(args, learner, data):
-        if learner.update == 2:
-            raise KeyboardInterrupt
-        return update(args, learner, data)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(single, "update", stop)
-        for run in parts.runs:
-            with pytest.raises(KeyboardInterrupt):
-                single.train(run)
-    interrupt(module, dataclasses.replace(parts, resume=True), monkeypatch, 4)
+    for run in parts.runs:
+        interrupted(single, run, monkeypatch, at_update=2)
+    interrupt(module, dataclasses.replace(parts, resume=True), monkeypatch, 2)
     runs = dataclasses.replace(parts, resume=True).runs
     for i, (run, expected) in enumerate(zip(runs, undisturbed, strict=True)):
         learner = single.train(run)
