@@ -73,6 +73,7 @@ class Environments(VectorEnv):
     """The environments of all agents, E of each, in turn: what make_envs makes for one of them.
 
     Bit for bit the same, statistics included, without the cost of N stacks of Gymnasium's wrappers.
+    They continue the learners' statistics, which `store` gives back.
     """
 
     def __init__(self, args: PopulationArgs, learners: list[Any]) -> None:
@@ -186,12 +187,6 @@ class Environments(VectorEnv):
     def close_extras(self, **kwargs: Any) -> None:
         for env in self.envs:
             env.close()
-
-
-def make_envs(args: PopulationArgs, learners: list[Any]) -> VectorEnv:
-    """The environments until the next checkpoint, which continue the agents' statistics."""
-    envs: VectorEnv = Environments(args, learners)
-    return args.perturb(envs)  # condwrap
 
 
 def stack_stats(learners: list[Any], name: str) -> RunningMeanStd:
@@ -669,7 +664,8 @@ def train(args: PopulationArgs, update: Callable[..., Any]) -> list[Any]:
     printed = -math.inf
     while learners[0].update < args.num_updates:  # from one checkpoint to the next
         checkpoint = learners[0].update // args.checkpoint_interval
-        envs = make_envs(args, learners)
+        envs: VectorEnv = Environments(args, learners)
+        envs = args.perturb(envs)  # condwrap
         seeds = [seed for run in runs for seed in single.env_seeds(run, checkpoint)]
         next_obs, _ = envs.reset(seed=seeds)
 

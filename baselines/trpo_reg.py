@@ -238,8 +238,6 @@ def make_envs(args: Args, stats: dict[str, RunningMeanStd]) -> VectorEnv:
         shape = envs.single_observation_space.shape
         envs = NormalizeObservation(envs, stats.setdefault("obs_rms", RunningMoments(shape=shape)))
 
-    envs = args.perturb(envs)  # condwrap
-
     if args.norm_reward:
         envs = NormalizeReward(envs, gamma=args.gamma)
         envs.return_rms = stats.setdefault("return_rms", RunningMoments())
@@ -771,6 +769,7 @@ def train(args: Args) -> Learner:
     while learner.update < args.num_updates:  # from one checkpoint to the next
         checkpoint = learner.update // args.checkpoint_interval
         envs = make_envs(args, learner.stats)
+        envs = args.perturb(envs)  # condwrap
         next_obs, _ = envs.reset(seed=env_seeds(args, checkpoint))
 
         for _ in range(min(args.checkpoint_interval, args.num_updates - learner.update)):

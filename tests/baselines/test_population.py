@@ -53,9 +53,9 @@ def test_what_agents_see_is_what_the_wrappers_would_show_bit_for_bit(env_id, num
     )
     learners, alone = learners_of(args), learners_of(args)
     for checkpoint in range(2):  # the second goes on with the statistics of the first
-        ours = population.make_envs(args, learners)
+        ours = args.perturb(population.Environments(args, learners))
         theirs = [
-            args.single.make_envs(run, x.stats)
+            run.perturb(args.single.make_envs(run, x.stats))
             for run, x in zip(args.runs, alone, strict=True)
         ]
         obs, _ = ours.reset(seed=seeds_of(args, checkpoint))
@@ -102,7 +102,7 @@ def test_the_agents_begin_as_their_single_selves_and_go_through_the_same_noise(m
     learners, alone = learners_of(args), learners_of(args)
     for learner in (*learners, *alone):
         torch.nn.init.zeros_(learner.actor.mean[-1].weight)  # so that actions are noise alone
-    envs = population.make_envs(args, learners)
+    envs = args.perturb(population.Environments(args, learners))
     next_obs, _ = envs.reset(seed=seeds_of(args))
     for _ in range(2):
         rollouts = population.rollout(args, learners, envs, next_obs)
@@ -130,7 +130,7 @@ def test_the_agents_begin_as_their_single_selves_and_go_through_the_same_noise(m
 def test_actions_are_those_of_each_agents_own_policy(module):
     args = arguments(module, env_id="test/Drift-v0")
     learners, alone = learners_of(args), learners_of(args)
-    envs = population.make_envs(args, learners)
+    envs = args.perturb(population.Environments(args, learners))
     next_obs, _ = envs.reset(seed=seeds_of(args))
     rollouts = population.rollout(args, learners, envs, next_obs)
     for data, learner in zip(rollouts, alone, strict=True):

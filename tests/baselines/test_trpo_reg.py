@@ -359,7 +359,7 @@ def collected(**changes):
     args = pendulum(trpo_reg, None, **changes)
     learner = trpo_reg.Learner(args)
     learner.regularizer = Spy(learner.regularizer)
-    envs = trpo_reg.make_envs(args, 0, learner.stats)
+    envs = trpo_reg.make_envs(args, learner.stats)
     next_obs, _ = envs.reset(seed=trpo_reg.env_seeds(args, 0))
     data = trpo_reg.rollout(args, learner, envs, next_obs)
     envs.close()

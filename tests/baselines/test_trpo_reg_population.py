@@ -69,7 +69,9 @@ def check_updates(dtype, tolerance: float, **changes) -> list[dict[str, float]]:
         for i, run in enumerate(args.runs):
             theirs = trpo_reg.update(run, alone[i], rollouts[i])
             assert list(ours[i]) == list(theirs)
-            assert ours[i] == pytest.approx(theirs, abs=10 * tolerance, rel=10 * tolerance, nan_ok=True)
+            assert ours[i] == pytest.approx(
+                theirs, abs=10 * tolerance, rel=10 * tolerance, nan_ok=True
+            )
             learners[i].update = alone[i].update = number + 1
             check_close(learners[i], alone[i], tolerance)
         found += ours

@@ -70,13 +70,13 @@ def test_peer(benchmark, algorithm, task):
 def single_iteration(baseline, task, **settings):
     args = baseline.Args(env_id=fast(task), **settings)
     learner = baseline.Learner(args)
-    envs = baseline.make_envs(args, 0, learner.stats)
+    envs = baseline.make_envs(args, learner.stats)
     state = {"obs": envs.reset(seed=1)[0]}
 
     def iterate():
         data = baseline.rollout(args, learner, envs, state["obs"])
-        losses = baseline.update(args, learner, data)
         learner.update += 1
+        losses = baseline.update(args, learner, data)
         state["obs"] = data.next_obs
         baseline.make_row(args, learner, data, losses, 0.0)
 
@@ -111,15 +111,13 @@ def population_iteration(algorithm, task, coefficient, agents):
     population = program.population
     args = program.Args(env_id=fast(task), coefficient=coefficient, num_agents=agents)
     learners = [args.single.Learner(each) for each in args.runs]
-    envs = population.make_envs(args, 0, learners)
+    envs = population.Environments(args, learners)
     state = {"obs": envs.reset(seed=list(range(agents)))[0]}
 
     def iterate():
-        rollouts = population.rollout(args, learners, envs, state["obs"])
+        rollouts, losses = population.iterate(args, learners, envs, state["obs"], program.update)
         state["obs"] = np.concatenate([data.next_obs for data in rollouts])
-        losses = program.update(args, learners, rollouts)
         for each, learner, *row in zip(args.runs, learners, rollouts, losses, strict=True):
-            learner.update += 1
             args.single.make_row(each, learner, *row, 0.0)
 
     with contextlib.closing(envs):
