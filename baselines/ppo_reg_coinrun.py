@@ -38,6 +38,11 @@ from torch.utils.tensorboard import SummaryWriter
 
 from condwrap import ConditioningRegularizer  # condwrap
 
+try:
+    from baselines import headless_qt
+except ImportError:  # this file was copied alone, and needs the system's libGL and GLib
+    headless_qt = None
+
 
 class RunError(Exception):
     """A run that cannot start, and what to do."""
@@ -384,21 +389,29 @@ ENGINES = {"envpool": EnvPoolEngine, "procgen": ProcgenEngine}
 @functools.cache
 def load_qt() -> None:
     """EnvPool's Procgen needs Qt 5's libraries: the system's, or those in the wheel PyQt5-Qt5."""
+    gui = "libQt5Gui.so.5"  # it loads libQt5Core.so.5
     wheel = importlib.util.find_spec("PyQt5")
     places = wheel.submodule_search_locations if wheel else []
-    for name in ("libQt5Core.so.5", "libQt5Gui.so.5"):
-        failures = []
-        for path in [name, *(f"{place}/Qt5/lib/{name}" for place in places)]:
-            try:
-                ctypes.CDLL(path, mode=ctypes.RTLD_GLOBAL)
-                break
-            except OSError as error:
-                failures.append(str(error))
-        else:
-            raise RunError(
-                "EnvPool needs Qt 5: pip install PyQt5-Qt5, which needs the system's libGL.so.1 "
-                f"and libgthread-2.0.so.0 (Debian: libgl1, libglib2.0-0). {'; '.join(failures)}"
-            )
+    in_wheel = [f"{place}/Qt5/lib/{gui}" for place in places]
+
+    load = functools.partial(ctypes.CDLL, mode=ctypes.RTLD_GLOBAL)
+    attempts = [(load, path) for path in [gui, *in_wheel]]
+    if headless_qt is not None:
+        attempts += [(headless_qt.load_headless_qt, path) for path in in_wheel]
+
+    failures = []
+    for attempt, path in attempts:
+        try:
+            attempt(path)
+            break
+        except OSError as error:
+            failures.append(str(error))
+    else:
+        raise RunError(
+            "EnvPool needs Qt 5: pip install PyQt5-Qt5, which needs the system's libGL.so.1 and "
+            f"libgthread-2.0.so.0 (Debian: libgl1, libglib2.0-0). {'; '.join(failures)}"
+        )
+
     if getattr(sys.modules.get("envpool.procgen"), "_PROCGEN_IMPORT_ERROR", None):
         del sys.modules["envpool.procgen"]  # it was imported before Qt was there, and gave up
 

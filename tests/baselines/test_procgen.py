@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import importlib.util
+import re
 import sys
 import types
 
@@ -257,40 +258,64 @@ def test_1000_steps_are_a_truncation(make):
 # --- what is not installed -----------------------------------------------------------------------
 
 
-def test_without_qt_the_error_says_what_to_install(make, monkeypatch):
-    def refuse(name, mode=None):
-        raise OSError(f"{name}: cannot open shared object file")
-
-    load_qt.cache_clear()
-    with monkeypatch.context() as patch:
-        patch.setattr(importlib.util, "find_spec", lambda name: None)
-        patch.setattr(ctypes, "CDLL", refuse)
-        with pytest.raises(
-            RunError, match=r"pip install PyQt5-Qt5.*libQt5Core\.so\.5: cannot open"
-        ):
-            make().reset(seed=0)
-    load_qt()
+def refuse(path, mode=None):
+    raise OSError(f"{path}: cannot open shared object file")
 
 
-def test_qt_is_taken_from_the_system_or_else_from_the_wheel(monkeypatch):
-    loaded, in_system = [], True
+@pytest.fixture
+def qt(monkeypatch):
+    """Stand-ins for what loads Qt, which record what they load; the wheel is in /wheel."""
+    loaded = []
+    wheel = types.SimpleNamespace(submodule_search_locations=["/wheel/PyQt5"])
+    headless = types.SimpleNamespace(load_headless_qt=refuse)
 
     def load(path, mode):
         assert mode == ctypes.RTLD_GLOBAL
-        if "/" not in path and not in_system:
-            raise OSError(path)
         loaded.append(path)
 
-    wheel = types.SimpleNamespace(submodule_search_locations=["/wheel/PyQt5"])
-    with monkeypatch.context() as patch:
-        patch.setattr(importlib.util, "find_spec", lambda name: wheel)
-        patch.setattr(ctypes, "CDLL", load)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: wheel)
+    monkeypatch.setattr(ctypes, "CDLL", load)
+    monkeypatch.setattr(ppo_reg_coinrun, "headless_qt", headless)
+    return types.SimpleNamespace(loaded=loaded, load=load, headless=headless)
+
+
+@pytest.mark.parametrize("alone", [False, True])
+def test_without_qt_the_error_says_what_to_install(qt, monkeypatch, alone):
+    monkeypatch.setattr(ctypes, "CDLL", refuse)
+    if alone:
+        monkeypatch.setattr(ppo_reg_coinrun, "headless_qt", None)
+    with pytest.raises(RunError, match=r"pip install PyQt5-Qt5.*libgl1, libglib2") as error:
         load_qt.__wrapped__()
-        in_system = False
+    tried = ["libQt5Gui.so.5", *["/wheel/PyQt5/Qt5/lib/libQt5Gui.so.5"] * (1 if alone else 2)]
+    assert re.findall(r"(\S+): cannot open", str(error.value)) == tried
+
+
+def test_without_the_wheel_the_error_says_what_to_install(qt, monkeypatch):
+    monkeypatch.setattr(ctypes, "CDLL", refuse)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(RunError, match=r"pip install PyQt5-Qt5.*libQt5Gui\.so\.5: cannot open"):
         load_qt.__wrapped__()
-    folder = "/wheel/PyQt5/Qt5/lib"
-    names = ["libQt5Core.so.5", "libQt5Gui.so.5"]
-    assert loaded == [*names, *(f"{folder}/{name}" for name in names)]
+
+
+def test_qt_is_taken_from_the_system_if_it_has_it(qt):
+    load_qt.__wrapped__()
+    assert qt.loaded == ["libQt5Gui.so.5"]
+
+
+def test_qt_is_taken_from_the_wheel_otherwise(qt, monkeypatch):
+    def load(path, mode):
+        return qt.load(path, mode) if "/" in path else refuse(path)
+
+    monkeypatch.setattr(ctypes, "CDLL", load)
+    load_qt.__wrapped__()
+    assert qt.loaded == ["/wheel/PyQt5/Qt5/lib/libQt5Gui.so.5"]
+
+
+def test_qt_is_loaded_headless_where_all_else_fails(qt, monkeypatch):
+    monkeypatch.setattr(ctypes, "CDLL", refuse)
+    qt.headless.load_headless_qt = qt.loaded.append
+    load_qt.__wrapped__()
+    assert qt.loaded == ["/wheel/PyQt5/Qt5/lib/libQt5Gui.so.5"]
 
 
 @pytest.mark.parametrize(
