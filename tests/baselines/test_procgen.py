@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode
 from torch import nn
 
 from baselines import ppo_reg_coinrun
-from baselines.ppo_reg_coinrun import GAMES, Procgen, RunError, load_qt, play
+from baselines.ppo_reg_coinrun import GAMES, Args, Procgen, RunError, load_qt, make_env, play
 from tests.baselines.helpers import Scripted
 
 STAY, RIGHT, JUMP_RIGHT = 4, 7, 8
@@ -28,8 +28,10 @@ def make():
     """Procgen, closed when the test ends."""
     made = []
 
-    def build(*args, **kwargs) -> Procgen:
-        made.append(Procgen(*args, **{"distribution_mode": "easy", "num_threads": 1, **kwargs}))
+    def build(game: str = "coinrun", num_envs: int = 1, **settings) -> Procgen:
+        settings = {"distribution_mode": "easy", "num_threads": 1, **settings}
+        args = Args(env_id=game, **settings)
+        made.append(make_env(args, num_envs, args.start_level))
         return made[-1]
 
     yield build
@@ -132,23 +134,6 @@ def test_closing_twice_and_resetting_after_it(make):
     assert make().reset(seed=0)[0].shape == (1, 3, 64, 64)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"num_levels": -1}, "num_levels must be at least 0, got -1"),
-        ({"start_level": -5}, "start_level must be at least 0, got -5"),
-        ({"num_threads": -2}, "num_threads must be at least 0, got -2"),
-        ({"num_envs": 0}, "num_envs must be at least 1, got 0"),
-        ({"distribution_mode": "extreme"}, "must be one of easy, hard, got 'extreme'"),
-        ({"game": "coinrunner"}, "game must be one of bigfish, .*, got 'coinrunner'"),
-        ({"backend": "unity"}, "backend must be one of envpool, procgen, got 'unity'"),
-    ],
-)
-def test_what_the_engine_would_misread_is_refused(make, arguments, message):
-    with pytest.raises(ValueError, match=message):
-        make(**arguments)
-
-
 def test_stepping_before_a_reset_is_refused(make):
     with pytest.raises(gym.error.ResetNeeded, match="reset the environments before"):
         make().step(np.zeros(1, int))
@@ -166,7 +151,7 @@ def test_level_seed_names_the_level_that_was_played(make, start, count):
     for frames, *_, info in play_randomly(env, 600):
         for i in np.flatnonzero(info["reset"]):
             playing[i] = levels[frames[i].tobytes()]
-        for i in np.flatnonzero(info.get("_level_seed", [])):
+        for i in np.flatnonzero(info.get("_episode", [])):
             assert info["level_seed"][i] == playing[i]
             seen.append(playing[i])
     assert set(seen) == set(range(start, start + count))
@@ -202,8 +187,7 @@ def test_a_reset_spends_one_step_after_each_end_and_counts_as_none(make):
         assert not (terminations & truncations).any()
         assert any(ended) == ("episode" in info)
         if any(ended):
-            for mask in ("_episode", "_success", "_level_seed"):
-                assert info[mask].tolist() == ended
+            assert info["_episode"].tolist() == ended
             for i in np.flatnonzero(ended):
                 ends += 1
                 assert (info["episode"]["l"][i], info["episode"]["r"][i]) == (
@@ -318,28 +302,21 @@ def test_qt_is_loaded_headless_where_all_else_fails(qt, monkeypatch):
     assert qt.loaded == ["/wheel/PyQt5/Qt5/lib/libQt5Gui.so.5"]
 
 
-@pytest.mark.parametrize(
-    ("backend", "module", "command"),
-    [
-        ("envpool", "envpool", "pip install envpool"),
-        ("procgen", "procgen", "pip install procgen-mirror"),
-    ],
-)
-def test_a_missing_engine_is_named_with_the_command(make, monkeypatch, backend, module, command):
-    monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(RunError, match=f"backend {backend} needs .*{command}"):
-        make(backend=backend).reset(seed=0)
+def test_a_missing_engine_is_named_with_the_command(make, monkeypatch):
+    monkeypatch.setitem(sys.modules, "envpool", None)
+    with pytest.raises(RunError, match="CoinRun needs EnvPool: pip install envpool"):
+        make().reset(seed=0)
 
 
 # --- play ----------------------------------------------------------------------------------------
 
 
 class Mover(nn.Module):
-    """Goes right, and jumps as a fixed function of the frame says; its dropout drops all."""
+    """Goes right, and jumps as a fixed function of the frame says."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.register_buffer("mask", torch.zeros(4))
+        self.device = torch.device("cpu")
         self.trained_in: list[bool] = []
 
     def forward(self, frames):
@@ -385,119 +362,46 @@ def test_play_is_without_dropout_and_leaves_the_agent_training():
     assert agent.training
 
 
-def test_play_changes_no_parameter_and_no_dropout_mask():
-    args = ppo_reg_coinrun.Args(dropout=0.5)
+@pytest.mark.parametrize("eval_dropout", [False, True])
+def test_play_changes_no_parameter_and_no_dropout_mask(eval_dropout):
+    args = Args(dropout=0.5, eval_dropout=eval_dropout)
     agent = ppo_reg_coinrun.Agent(args, torch.Generator())
-    agent.mask.zero_()
-    agent.mask[::2] = 2.0
+    mask = agent.network[9].mask
+    mask.zero_()
+    mask[:, ::2] = 2.0
     before = {name: x.clone() for name, x in agent.state_dict().items()}
     play(agent, Scripted(lengths=[[2], [3]]), 0, torch.Generator())
     assert all(torch.equal(x, before[name]) for name, x in agent.state_dict().items())
 
 
-# --- OpenAI's engine, its package faked ----------------------------------------------------------
+# --- themes ---------------------------------------------------------------------------------------
 
 
-class FakeProcgenGym3Env:
-    """Episodes of the lengths that it is told, in the order and with the fields of the real one."""
+def test_restricted_themes_show_one_ground_where_all_show_several(make):
+    """The ground fills the lower left corner of every first frame."""
 
-    lengths: tuple[int, ...] = ()
-    made: list[dict] = []  # noqa: RUF012
+    def grounds(restrict: bool) -> int:
+        corners = set()
+        for level in range(12):
+            settings = {"num_levels": 1, "start_level": level, "distribution_mode": "hard"}
+            frame = make(**settings, restrict_themes=restrict).reset(seed=0)[0][0]
+            corners.add(frame[:, 56:, :8].tobytes())
+        return len(corners)
 
-    def __init__(self, **kwargs) -> None:
-        self.made.append(kwargs)
-        self.num, self.t, self.first = kwargs["num"], np.zeros(kwargs["num"], int), True
-        self.episode = np.zeros(self.num, int)
-        self.rewards, self.ended = np.zeros(self.num, np.float32), np.ones(self.num, bool)
-
-    def observe(self):
-        rgb = np.zeros((self.num, 64, 64, 3), np.uint8)
-        rgb[..., 0] = (self.t % 256)[:, None, None]
-        rgb[..., 2] = 7
-        return self.rewards, {"rgb": rgb}, self.ended
-
-    def act(self, actions):
-        assert actions.dtype == np.int32
-        self.t += 1
-        self.ended = self.t == np.array(self.lengths)
-        self.won = self.ended & (self.t < 1000)
-        self.rewards = np.where(self.won, 10, 0).astype(np.float32)
-        self.previous = self.episode.copy()
-        self.episode += self.ended
-        self.t[self.ended] = 0
-
-    def get_info(self):
-        columns = zip(self.previous, self.won, self.episode, strict=True)
-        names = ("prev_level_seed", "prev_level_complete", "level_seed")
-        return [dict(zip(names, (int(x) for x in row), strict=True)) for row in columns]
-
-    def close(self):
-        pass
+    assert grounds(restrict=False) > 1
+    assert grounds(restrict=True) == 1
 
 
-@pytest.fixture
-def fake_procgen(monkeypatch):
-    monkeypatch.setitem(
-        sys.modules, "procgen", types.SimpleNamespace(ProcgenGym3Env=FakeProcgenGym3Env)
-    )
-    monkeypatch.setattr(FakeProcgenGym3Env, "made", [])
+def test_a_level_is_laid_out_alike_whatever_its_themes(make):
+    """The same actions lead to the same rewards and ends, on frames that differ."""
+    answers = []
+    frames = []
+    for restrict in (False, True):
+        env = make(num_envs=16, distribution_mode="hard", restrict_themes=restrict)
+        frames.append(env.reset(seed=3)[0].copy())
+        steps = list(play_randomly(env, 300))
+        answers.append([(r.tolist(), t.tolist(), c.tolist()) for _, r, t, c, _ in steps])
+        assert any("episode" in info for *_, info in steps)
 
-    def set_lengths(*lengths: int) -> None:
-        monkeypatch.setattr(FakeProcgenGym3Env, "lengths", lengths)
-
-    return set_lengths
-
-
-def test_the_original_engine_gets_the_settings(make, fake_procgen):
-    settings = {"num_levels": 9, "start_level": 4, "paint_vel_info": False}
-    env = make("maze", 2, backend="procgen", **settings, distribution_mode="hard", num_threads=3)
-    env.reset(seed=5)
-    made = FakeProcgenGym3Env.made[0]
-    assert isinstance(made.pop("rand_seed"), int)
-    expected = {"num": 2, "env_name": "maze", "distribution_mode": "hard", "num_threads": 3}
-    assert made == {**expected, **settings}
-
-
-def test_the_original_engine_begins_an_episode_in_the_step_that_ends_one(make, fake_procgen):
-    fake_procgen(3, 5)
-    env = make(num_envs=2, backend="procgen")
-    assert env.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
-    frames, _ = env.reset(seed=0)
-    assert frames.shape == (2, 3, 64, 64)
-    assert frames[0, :, 0, 0].tolist() == [0, 0, 7]
-    seen = []
-    for _ in range(10):
-        frames, rewards, terminations, truncations, info = env.step(np.zeros(2, int))
-        assert not info["reset"].any()
-        assert not truncations.any()
-        for i in np.flatnonzero(terminations):
-            assert frames[i, 0, 0, 0] == 0  # the next episode's
-            assert rewards[i] == 10
-            row = (info["episode"]["l"][i], info["episode"]["r"][i], info["level_seed"][i])
-            seen.append((i, *(int(x) for x in row), bool(info["success"][i])))
-            assert info["_success"][i]
-    ends = [(0, 3, 0), (1, 5, 0), (0, 3, 1), (0, 3, 2), (1, 5, 1)]
-    assert seen == [(i, length, 10, level, True) for i, length, level in ends]
-
-
-@pytest.mark.parametrize(("game", "limit"), [("coinrun", 1000), ("maze", 500), ("plunder", 4000)])
-def test_the_original_engines_time_limit_is_a_truncation(make, fake_procgen, game, limit):
-    fake_procgen(limit, limit - 1)
-    env = make(game, num_envs=2, backend="procgen")
-    env.reset(seed=0)
-    for _ in range(limit):
-        _, _, terminations, truncations, info = env.step(np.zeros(2, int))
-        if truncations[0]:
-            assert info["episode"]["l"][0] == limit
-        if terminations[1]:
-            assert info["episode"]["l"][1] == limit - 1
-    assert truncations.tolist() == [True, False]
-    assert not terminations.any()
-
-
-@pytest.mark.parametrize("game", GAMES)
-def test_the_original_engines_time_limits_are_those_of_envpools_port(make, game):
-    env = make(game)
-    env.reset(seed=0)
-    limit = env.engine.pool.spec.config.max_episode_steps
-    assert ppo_reg_coinrun.TIME_LIMITS.get(game, 1000) == limit
+    assert answers[0] == answers[1]
+    assert (frames[0] != frames[1]).any()

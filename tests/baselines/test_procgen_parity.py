@@ -7,53 +7,23 @@ with the original engine linked to the Qt that EnvPool uses.
 
 from __future__ import annotations
 
-import inspect
 import json
 import os
 import subprocess
 import sys
 import tempfile
-import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 from gymnasium.utils import seeding
 
-from baselines.ppo_reg_coinrun import GAMES, TIME_LIMITS, Procgen, ProcgenEngine, load_qt
+from baselines.ppo_reg_coinrun import GAMES, Args, Procgen, load_qt, make_env
+from tests.baselines import procgen_original
+from tests.baselines.procgen_original import TIME_LIMITS, digest
 
 pytestmark = pytest.mark.slow
 SEED = 5
-
-# Its packages cannot share an environment with ours. So this runs in one of its own, where the
-# baseline cannot be imported: it takes the source of the class that reads the engine.
-RECORDER = """
-import json, os, sys, zlib
-import numpy as np
-
-class AutoresetMode:
-    SAME_STEP = None
-
-config = json.loads(sys.stdin.read())
-TIME_LIMITS = config["time_limits"]
-exec(config["source"])
-for run in config["runs"]:
-    actions = np.load(run["actions"])
-    engine = ProcgenEngine(*run["arguments"])
-    frames = [engine.first_frames()]
-    rows = []
-    for step in actions:
-        engine.send(step)
-        frame, *row, success, level_seed = engine.receive()
-        frames.append(frame)
-        rows.append([*row, success(), level_seed()])
-    first = np.array(frames[: run["keep"]])
-    digests = [[zlib.crc32(np.ascontiguousarray(x).tobytes()) for x in frame] for frame in frames]
-    names = ("rewards", "terminations", "truncations", "success", "level_seed")
-    columns = dict(zip(names, map(np.array, zip(*rows))))
-    np.savez(run["out"], digests=np.array(digests), first=first, **columns)
-    engine.close()
-"""
 
 
 @pytest.fixture(scope="module")
@@ -90,10 +60,8 @@ def record(
     python: Path, folder: Path, runs: list[dict], *, own_qt: bool = False
 ) -> list[dict[str, np.ndarray]]:
     """What OpenAI's engine answers, `[T, N]`, and its T + 1 frames."""
-    source = inspect.getsource(ProcgenEngine)
-    config = {"source": source, "time_limits": TIME_LIMITS, "runs": runs}
     recorder = subprocess.run(
-        [python, "-c", RECORDER], input=json.dumps(config), text=True, capture_output=True,
+        [python, procgen_original.__file__], input=json.dumps(runs), text=True, capture_output=True,
         cwd=folder, env=choose_qt(python, own_qt), check=False,
     )  # fmt: skip
     assert recorder.returncode == 0, recorder.stderr
@@ -107,9 +75,6 @@ def compare(env: Procgen, actions: np.ndarray, expected: dict[str, np.ndarray]) 
     """
     num_envs, steps = env.num_envs, len(actions)
     taken, everyone = np.zeros(num_envs, int), np.arange(num_envs)
-
-    def digest(frames: np.ndarray) -> np.ndarray:
-        return np.array([zlib.crc32(frame.tobytes()) for frame in frames])
 
     np.testing.assert_array_equal(digest(env.reset(seed=SEED)[0]), expected["digests"][0])
     episodes, running = 0, np.ones(num_envs, bool)
@@ -139,14 +104,30 @@ def compare(env: Procgen, actions: np.ndarray, expected: dict[str, np.ndarray]) 
 
 def request(folder: Path, settings: dict, steps: int, keep: int = 0) -> tuple[Procgen, dict]:
     """A pool of EnvPool's, and what the recorder needs to know to do the same."""
-    env = Procgen(**settings)
+    chosen = dict(settings)
+    num_envs = chosen.pop("num_envs")
+    args = Args(**chosen)
+    env = make_env(args, num_envs, args.start_level)
+
     path = Path(tempfile.mkdtemp(dir=folder))
     rng = np.random.default_rng(0)
-    actions = rng.choice([1, 4, 7, 7, 8, 8, 8, *range(15)], (steps, env.num_envs))
+    actions = rng.choice([1, 4, 7, 7, 8, 8, 8, *range(15)], (steps, num_envs))
     np.save(path / "actions.npy", actions.astype(np.int32))
-    seed = int(seeding.np_random(SEED)[0].integers(2**31))  # which reset(seed=SEED) draws
-    run = {"arguments": [*env.make_engine.args, seed], "keep": keep}
-    return env, {**run, "actions": str(path / "actions.npy"), "out": str(path / "recorded.npz")}
+
+    engine = {
+        "game": args.env_id,
+        "mode": args.distribution_mode,
+        "num_envs": num_envs,
+        "seed": int(seeding.np_random(SEED)[0].integers(2**31)),  # which reset(seed=SEED) draws
+        "options": {
+            "num_levels": args.num_levels,
+            "start_level": args.start_level,
+            "paint_vel_info": args.paint_vel_info,
+            "restrict_themes": args.restrict_themes,
+        },
+    }
+    files = {"actions": str(path / "actions.npy"), "out": str(path / "recorded.npz")}
+    return env, {"engine": engine, "keep": keep, **files}
 
 
 def check(python: Path, folder: Path, runs: list[dict], steps: int) -> list[int]:
@@ -161,11 +142,12 @@ def check(python: Path, folder: Path, runs: list[dict], steps: int) -> list[int]
 
 
 @pytest.mark.parametrize("mode", ["easy", "hard"])
-@pytest.mark.parametrize("paint_vel_info", [False, True])
-def test_coinrun_is_the_same_over_hundreds_of_levels(python, tmp_path, mode, paint_vel_info):
-    settings = {"distribution_mode": mode, "paint_vel_info": paint_vel_info, "num_envs": 64}
+@pytest.mark.parametrize("option", ["paint_vel_info", "restrict_themes", "neither"])
+def test_coinrun_is_the_same_over_hundreds_of_levels(python, tmp_path, mode, option):
+    chosen = {name: name == option for name in ("paint_vel_info", "restrict_themes")}
+    settings = {"distribution_mode": mode, "num_envs": 64, **chosen}
     levels = [{"num_levels": 500}, {"num_levels": 500, "start_level": 500}, {"num_levels": 0}]
-    ended = check(python, tmp_path, [{**settings, **chosen} for chosen in levels], steps=400)
+    ended = check(python, tmp_path, [{**settings, **some} for some in levels], steps=400)
     assert min(ended) > 64
 
 
@@ -177,7 +159,7 @@ def test_coinruns_time_limit_is_the_same(python, tmp_path):
 def test_every_game_is_the_same(python, tmp_path):
     run = {"num_envs": 8, "num_levels": 100, "paint_vel_info": False}
     runs = [
-        {**run, "game": game, "distribution_mode": mode}
+        {**run, "env_id": game, "distribution_mode": mode}
         for game in GAMES
         for mode in ("easy", "hard")
     ]
@@ -206,3 +188,12 @@ def test_with_its_own_qt_the_original_engine_draws_almost_the_same(
     assert 10 < running.sum() < 32
     assert 0 < np.mean(np.array(distances) > 0) < share
     assert np.mean(distances) < difference
+
+
+@pytest.mark.parametrize("game", GAMES)
+def test_the_time_limits_are_those_of_envpools_port(game):
+    env = make_env(Args(env_id=game), 1, 0)
+    env.reset(seed=0)
+    limit = env.pool.spec.config.max_episode_steps
+    env.close()
+    assert TIME_LIMITS.get(game, 1000) == limit
