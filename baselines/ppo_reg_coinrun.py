@@ -918,7 +918,7 @@ def load_checkpoint(args: Args) -> dict[str, Any] | None:
         except Exception as error:  # whatever a torn file makes the reader stumble over
             print(f"{candidate} cannot be read: {error!r}")
             continue
-        check_same(args, saved["args"])
+        check_same(args, saved)
         return saved
 
     if found:
@@ -926,17 +926,24 @@ def load_checkpoint(args: Args) -> dict[str, Any] | None:
     return None
 
 
-def check_same(args: Args, before: dict[str, Any]) -> None:
-    """Raise RunError unless the run was begun with these arguments."""
-    for name, value in before.items():
+def check_same(args: Args, saved: dict[str, Any]) -> None:
+    """Raise RunError unless the run was begun with these arguments, or can be extended to them."""
+    longer = args.extend and args.total_timesteps > saved["args"]["total_timesteps"]
+    for name, value in saved["args"].items():
         now = getattr(args, name, None)
-        longer = name == "total_timesteps" and args.extend and now > value
-        if value != now and not longer:
+        if value != now and not (longer and name == "total_timesteps"):
             raise RunError(f"{args.path} was run with {name}={value}, not {now}")
-    if args.extend and args.anneal and not args.anneal_timesteps:
+
+    if longer and args.anneal and not args.anneal_timesteps:
         raise RunError(
-            "a run that anneals to its own end depends on its length: it cannot be extended, "
-            "unless it was begun with --no-anneal or with --anneal-timesteps"
+            "a run that anneals over its own length depends on it: it cannot be extended, unless "
+            "it began with --no-anneal or with --anneal-timesteps"
+        )
+    update = saved["learner"]["update"]
+    if longer and update % args.checkpoint_interval:
+        raise RunError(
+            f"{args.path} cannot be extended: its {update} updates are not a multiple of "
+            f"checkpoint_interval={args.checkpoint_interval}, at which environments are rebuilt"
         )
 
 

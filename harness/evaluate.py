@@ -187,7 +187,7 @@ def load_agent(checkpoint: Path, device: str) -> tuple[Agent, Args]:
 def record(agent: Agent, args: Args, level: int, path: Path) -> None:
     """The greedy agent's episode on a level, or its first GIF_FRAMES frames, as an animated GIF."""
     env = Levels(args, [level], 1)
-    frames, pictures, device = env.reset(seed=0)[0], [], agent.mask.device
+    frames, pictures, device = env.reset(seed=0)[0], [], agent.device
     agent.eval()
     while len(pictures) < GIF_FRAMES:
         size = (GIF_ZOOM * 64, GIF_ZOOM * 64)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from baselines.ppo_reg_coinrun import Agent, Args, Learner, Residual, sample
+from baselines.ppo_reg_coinrun import Agent, Args, Dropout, Learner, Residual, sample
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -60,7 +60,6 @@ def test_networks_have_the_papers_sizes(network, features, count):
     agent = Agent(Args(network=network), seeded())
     assert sum(p.numel() for p in agent.network.parameters()) == count
     assert sum(p.numel() for p in agent.parameters()) == count + (features + 1) * 16
-    assert agent.mask.tolist() == [1.0] * features
     frames = torch.randint(0, 256, (5, 3, 64, 64), dtype=torch.uint8, generator=seeded())
     logprobs, values = agent(frames)
     assert (logprobs.shape, values.shape) == ((5, 15), (5,))
@@ -71,44 +70,119 @@ def test_networks_have_the_papers_sizes(network, features, count):
     assert torch.equal(agent.logprobs(frames), logprobs)
 
 
+def frames_of(seed: int, count: int = 2) -> torch.Tensor:
+    return torch.randint(0, 256, (count, 3, 64, 64), dtype=torch.uint8, generator=seeded(seed))
+
+
+@pytest.mark.parametrize("network", ["nature", "impala"])
+def test_weights_are_orthogonal_and_biases_0(network):
+    agent = Agent(Args(network=network), seeded())
+    gains = {agent.policy: 0.01, agent.value: 1.0}
+    gains.update({m.body[4]: 0.0 for m in agent.modules() if isinstance(m, Residual)})
+    layers = [m for m in agent.modules() if isinstance(m, nn.Conv2d | nn.Linear)]
+    assert len(layers) == {"nature": 6, "impala": 18}[network]
+    for layer in layers:
+        values = torch.linalg.svdvals(layer.weight.flatten(1))
+        gain = gains.get(layer, 2**0.5)
+        torch.testing.assert_close(values, torch.full_like(values, gain), atol=1e-5, rtol=1e-4)
+        assert not layer.bias.any()
+
+
 def test_a_residual_block_begins_as_the_identity():
-    x = torch.randn(2, 8, 5, 5, generator=seeded())
-    block = Residual(8, seeded())
+    agent = Agent(Args(network="impala"), seeded())
+    block = next(m for m in agent.modules() if isinstance(m, Residual))
+    x = torch.randn(2, 16, 32, 32, generator=seeded())
     assert torch.equal(block(x), x)
-    nn.init.ones_(block.body[3].bias)
+    nn.init.ones_(block.body[4].bias)
     assert torch.equal(block(x), x + 1)
 
 
-def test_weights_are_orthogonal_and_biases_0():
-    agent = Agent(Args(), seeded())
-    for name, p in agent.named_parameters():
-        if name.endswith("bias"):
-            assert not p.any()
-    w = agent.policy.weight.double()
-    torch.testing.assert_close(w @ w.T, 1e-4 * torch.eye(15).double(), atol=1e-8, rtol=1e-4)
+def test_a_residual_block_by_hand():
+    """One channel of one pixel: x + c2 · relu(c1 · relu(x) + b1) + b2 by the kernels' centers."""
+    block = Residual(Args(), 1, 1)
+    for conv, weight, bias in ((block.body[1], 3.0, -2.0), (block.body[4], 0.5, 0.25)):
+        nn.init.constant_(conv.weight, weight)
+        nn.init.constant_(conv.bias, bias)
+    x = torch.tensor([-1.0, 0.5, 2.0]).view(3, 1, 1, 1)
+    # relu(x) = 0, 0.5, 2; relu(3 · that - 2) = 0, 0, 4; half of that and 0.25 are added
+    assert block(x).flatten().tolist() == [-0.75, 0.75, 4.25]
 
 
-def test_a_dropout_mask_is_for_all_states_and_only_while_training():
-    args = Args(dropout=0.5)
-    learner = Learner(args)
-    agent, frames = learner.agent, torch.zeros(2, 3, 64, 64, dtype=torch.uint8)
-    learner.draw_mask(args)
-    assert set(agent.mask.tolist()) == {0.0, 2.0}
-    assert 0.4 < (agent.mask == 0).float().mean() < 0.6
-    first = agent.mask.clone()
-    nn.init.ones_(agent.network[7].bias)  # hidden features of black frames are then 1
-    nn.init.ones_(agent.value.weight)
-    assert agent(frames)[1].tolist() == [first.sum().item()] * 2
+# --- dropout -------------------------------------------------------------------------------------
+
+
+def dropouts(agent: Agent) -> list[Dropout]:
+    return [m for m in agent.modules() if isinstance(m, Dropout)]
+
+
+def test_in_impala_dropout_follows_every_convolution():
+    """As in Lee et al.'s code: before the pooling of a section and in its residual blocks."""
+    agent = Agent(Args(network="impala", dropout=0.1), seeded())
+    order = [m for m in agent.modules() if isinstance(m, nn.Conv2d | nn.Linear | Dropout)]
+    for first, second in zip(order[:-1:2], order[1::2], strict=False):
+        if isinstance(first, nn.Conv2d):
+            assert isinstance(second, Dropout)
+    sections = [(16, 64), (32, 32), (32, 16)]
+    shapes = [
+        (1, channels, side, side)
+        for channels, begin in sections
+        for side in (begin, *[begin // 2] * 4)
+    ]
+    assert [tuple(m.mask.shape) for m in dropouts(agent)] == shapes
+    assert isinstance(agent.network[0], nn.Conv2d)
+    assert isinstance(agent.network[1], Dropout)
+    assert isinstance(agent.network[2], nn.MaxPool2d)
+
+
+def test_in_naturecnn_dropout_follows_the_last_hidden_layer():
+    agent = Agent(Args(dropout=0.1), seeded())
+    assert [tuple(m.mask.shape) for m in dropouts(agent)] == [(1, 512)]
+    assert isinstance(agent.network[-1], Dropout)
+
+
+def test_dropout_by_hand():
+    dropout = Dropout(Args(dropout=0.75), 6)
+    dropout.draw(seeded())
+    kept = torch.rand(1, 6, generator=seeded()) >= 0.75
+    x = torch.arange(12.0).view(2, 6)
+    assert torch.equal(dropout(x), torch.where(kept, 4 * x, 0.0))
+    assert 0 < kept.sum() < 6
+
+
+@pytest.mark.parametrize("network", ["nature", "impala"])
+def test_a_share_of_the_features_is_left_out_of_every_state_alike(network):
+    learner = Learner(Args(network=network, dropout=0.25))
+    learner.draw_masks()
+    masks = [m.mask for m in dropouts(learner.agent)]
+    for mask in masks:
+        assert mask.unique().tolist() == pytest.approx([0.0, 4 / 3])
+        assert 0.15 < (mask == 0).float().mean() < 0.35
+    first = [mask.clone() for mask in masks]
+    learner.draw_masks()
+    assert not any(torch.equal(*pair) for pair in zip(first, masks, strict=True))
+
+    logprobs, _ = learner.agent(frames_of(0))
+    alone, _ = learner.agent(frames_of(0)[1:])
+    torch.testing.assert_close(logprobs[1:], alone)
+
+
+@pytest.mark.parametrize("network", ["nature", "impala"])
+@pytest.mark.parametrize("eval_dropout", [False, True])
+def test_evaluation_is_without_dropout_unless_it_is_asked_for(network, eval_dropout):
+    learner = Learner(Args(network=network, dropout=0.5, eval_dropout=eval_dropout))
+    plain = Learner(Args(network=network)).agent  # of the same weights
+    learner.draw_masks()
+    agent = learner.agent
+    trained, _ = agent(frames_of(0))
+    assert not torch.equal(trained, plain(frames_of(0))[0])
     agent.eval()
-    assert agent(frames)[1].tolist() == [512.0] * 2
-    learner.draw_mask(args)
-    assert not torch.equal(agent.mask, first)
+    expected = trained if eval_dropout else plain(frames_of(0))[0]
+    torch.testing.assert_close(agent(frames_of(0))[0], expected)
 
 
-def test_without_dropout_nothing_is_drawn_and_the_mask_is_1():
-    args = Args()
-    learner = Learner(args)
+def test_without_dropout_nothing_is_drawn_or_kept():
+    learner = Learner(Args(network="impala"))
     before = learner.generators["dropout"].get_state()
-    learner.draw_mask(args)
+    learner.draw_masks()
     assert torch.equal(learner.generators["dropout"].get_state(), before)
-    assert learner.agent.mask.eq(1).all()
+    assert not any("mask" in name for name in learner.agent.state_dict())

@@ -86,6 +86,7 @@ class Ours:
 
     def iterate(self) -> None:
         data = ours.rollout(self.args, self.learner, self.envs, self.frames)
+        self.learner.update += 1
         losses = ours.update(self.args, self.learner, data)
         assert all(math.isfinite(x) for x in losses.values())
 

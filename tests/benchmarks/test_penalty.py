@@ -24,8 +24,9 @@ def mlp() -> tuple[nn.Module, tuple[int, ...]]:
 
 
 def impala() -> tuple[nn.Module, tuple[int, ...]]:
-    rng = torch.Generator().manual_seed(0)
-    return nn.Sequential(ppo_reg_coinrun.impala(rng), nn.Linear(256, 15)), (3, 64, 64)
+    args = ppo_reg_coinrun.Args(network="impala")
+    agent = ppo_reg_coinrun.Agent(args, torch.Generator().manual_seed(0))
+    return nn.Sequential(agent.network, agent.policy), (3, 64, 64)
 
 
 MEMORY = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30  # GiB

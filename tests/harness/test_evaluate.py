@@ -143,7 +143,7 @@ def own_engine(monkeypatch):
 @pytest.fixture
 def agent() -> Agent:
     made = Agent(ARGS, torch.Generator().manual_seed(0))
-    made.mask.zero_()  # with dropout on, it would see nothing
+    made.network[-1].mask.zero_()  # with dropout on, it would see nothing
     return made
 
 
