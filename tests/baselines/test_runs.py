@@ -55,7 +55,7 @@ every_baseline = pytest.mark.parametrize("baseline", ALL, ids=label)
     [
         *[(baseline, {}) for baseline in ALL],
         *[(baseline, {"env_id": "HopperBulletEnv-v0"}) for baseline in BASELINES],
-        (ppo_reg_coinrun, {"network": "impala", "dropout": 0.5, "l2": 1e-4, "norm_reward": True}),
+        (ppo_reg_coinrun, {"network": "impala", "dropout": 0.5, "l2": 1e-4}),
     ],
     ids=label,
 )
@@ -223,7 +223,7 @@ def draw_from(agent, env, seed, rng):
         *[(baseline, changes) for baseline in BASELINES for changes in EVERY_BASELINE],
         (ppo_reg, {"perturb_obs": True, "anneal_lr": True}),
         (trpo_reg, {"perturb_obs": True}),
-        (ppo_reg_coinrun, {"num_envs": 2, "num_groups": 2, "dropout": 0.5, "norm_reward": True}),
+        (ppo_reg_coinrun, {"num_envs": 2, "num_groups": 2, "dropout": 0.5, "network": "impala"}),
         (ppo_reg_coinrun, {"distribution_mode": "hard", "num_steps": 64, "eval_interval": 2}),
     ],
     ids=label,
