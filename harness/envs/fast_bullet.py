@@ -15,6 +15,9 @@ replace small arrays. What a user sees stays equal:
   the last bit, the stock task's is kept: NumPy's sine, cosine, arctan2 and dot product; its sums
   over one axis (pairwise); and the type of a Python float times a NumPy scalar, the scalar's.
 
+One more task has no stock counterpart: FastHalfCheetahPyBulletEnv-v0, whose episodes end when the
+cheetah falls, as in pybullet-gym, the paper's simulator. But for `Fast` its id is the one there.
+
 This holds for the sources of the stock tasks that tests/harness/envs/test_fast_bullet.py names by
 their hashes; the same file compares the two, step by step.
 """
@@ -225,6 +228,18 @@ class FastHalfCheetahBulletEnv(FastWalkerEnv, tasks.HalfCheetahBulletEnv):
     fast_robot = type("HalfCheetah", (Walker, robots.HalfCheetah), {})
 
 
+class FastHalfCheetahPyBulletEnv(FastHalfCheetahBulletEnv):
+    """HalfCheetah as pybullet-gym has it: the step that earns -1 for being down ends the episode.
+
+    Down is a pitch of 1 or more, or ground under a shin or a thigh after the step before: a step's
+    reward is summed up before its contacts are read, there as here. The stock task takes the same
+    -1 and plays on to its 1000 steps.
+    """
+
+    def _isDone(self) -> bool:  # noqa: N802 - the stock task's name
+        return self._alive < 0
+
+
 class FastAntBulletEnv(FastWalkerEnv, tasks.AntBulletEnv):
     fast_robot = type("Ant", (Walker, robots.Ant), {})
 
@@ -302,10 +317,16 @@ class FastInvertedDoublePendulumBulletEnv(FastEnv, InvertedDoublePendulumBulletE
         return state, sum(self.rewards), bool(robot.pos_y + 0.3 <= 1), False, {}
 
 
-for spec in [gym.spec(f"{name}BulletEnv-v0") for name in NAMES]:
+def register(name: str, spec: gym.envs.registration.EnvSpec) -> None:
+    """Register a task of this module with a stock task's time limit and reward threshold."""
     gym.register(
-        f"Fast{spec.id}",
-        f"{__name__}:Fast{spec.name}",
+        f"Fast{name}-v0",
+        f"{__name__}:Fast{name}",
         reward_threshold=spec.reward_threshold,
         max_episode_steps=spec.max_episode_steps,
     )
+
+
+for stock in [gym.spec(f"{name}BulletEnv-v0") for name in NAMES]:
+    register(stock.name, stock)
+register("HalfCheetahPyBulletEnv", gym.spec("HalfCheetahBulletEnv-v0"))

@@ -275,6 +275,20 @@ def test_the_four_algorithms_of_the_paper_differ_by_baseline_and_coefficient(nam
         assert runs[plain].args["coefficient"] == 0
 
 
+def test_the_papers_cheetah_falls_and_the_zoos_plays_on():
+    tasks = {
+        name: {r.args["env_id"] for r in load_suite(name).runs if r.environment == "HalfCheetah"}
+        for name in ("table1", "ablation", "smoke", "strong")
+    }
+    module = "harness.envs.fast_bullet"
+    falls, plays_on = (
+        f"{module}:FastHalfCheetahPyBulletEnv-v0",
+        f"{module}:FastHalfCheetahBulletEnv-v0",
+    )
+    assert tasks.pop("strong") == {plays_on}
+    assert set(map(tuple, tasks.values())) == {(falls,)}
+
+
 def test_figure1_is_four_settings_of_plain_ppo_on_four_tasks():
     suite = load_suite("figure1")
     assert suite.environments == ["Humanoid", "Hopper", "Ant", "Reacher"]

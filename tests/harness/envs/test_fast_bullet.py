@@ -267,3 +267,106 @@ def test_close_frees_the_simulation(pair, make, task):
         assert other.unwrapped.physicsClientId == client  # Bullet gives the id to the next
         with pytest.raises(pybullet.error, match="Not connected"):
             env.step(action)
+
+
+# --- HalfCheetah as pybullet-gym has it -----------------------------------------------------------
+
+FALLING = f"{fast_bullet.__name__}:FastHalfCheetahPyBulletEnv-v0"
+PLAYING_ON = f"{fast_bullet.__name__}:FastHalfCheetahBulletEnv-v0"
+
+
+class Cheetah:
+    """The cheetah as Bullet itself knows it, without the task's or the robot's own numbers."""
+
+    def __init__(self, env):
+        self.client = env.unwrapped.physicsClientId
+        bodies = range(pybullet.getNumBodies(self.client))
+        links = {body: self.names(body, 12) for body in bodies}
+        self.body = next(body for body in bodies if "bthigh" in links[body])
+        self.links, self.joints = links[self.body], self.names(self.body, 1)
+
+    def names(self, body, which):
+        joints = range(pybullet.getNumJoints(body, self.client))
+        return [pybullet.getJointInfo(body, i, self.client)[which].decode() for i in joints]
+
+    def pitch(self):
+        link = self.links.index("torso")
+        turned = pybullet.getLinkState(self.body, link, physicsClientId=self.client)[1]
+        return pybullet.getEulerFromQuaternion(turned)[1]
+
+    def grounded(self):
+        """The links that touch another body: there is none but the floor."""
+        contacts = pybullet.getContactPoints(self.body, physicsClientId=self.client)
+        return {self.links[c[3]] for c in contacts if c[2] != self.body}
+
+    def place(self, height, pitch):
+        """Hold it up in the air, so that it touches nothing."""
+        for name, value in (("ignorez", height), ("ignorey", pitch)):
+            joint = self.joints.index(name)
+            pybullet.resetJointState(self.body, joint, value, physicsClientId=self.client)
+
+
+def test_the_cheetahs_episode_ends_by_the_written_rule(make):
+    """|pitch| >= 1, or a shin or thigh on the ground after the step before."""
+    env = make(FALLING)
+    env.reset(seed=0)
+    cheetah, rng = Cheetah(env), np.random.default_rng(0)
+    legs = {"fshin", "fthigh", "bshin", "bthigh"}
+    blamed, lengths, returns = set(), [], []
+    for _ in range(30):
+        down, total, steps = set(), 0.0, 0
+        env.reset()
+        while steps < 1000:
+            action = rng.normal(size=6).clip(-1, 1).astype(np.float32)  # as a new policy acts
+            _, reward, terminated, truncated, _ = env.step(action)
+            expected = abs(cheetah.pitch()) >= 1 or bool(down)
+            assert (terminated, truncated) == (expected, False)
+            assert env.unwrapped.rewards[0] == (-1.0 if expected else 1.0)
+            steps, total = steps + 1, total + reward
+            if terminated:
+                break
+            down = cheetah.grounded() & legs
+        blamed |= down
+        lengths.append(steps)
+        returns.append(total)
+    assert len(blamed) >= 2
+    assert 10 < np.mean(lengths) < 30  # the stock task plays 1000, for about -1300
+    assert -8 < np.mean(returns) < 4
+
+
+@pytest.mark.parametrize(
+    ("pitch", "ends"), [(0.9, False), (1.1, True), (-0.9, False), (-1.1, True)]
+)
+def test_a_cheetah_that_turns_over_in_the_air_is_down(make, pitch, ends):
+    env = make(FALLING)
+    env.reset(seed=0)
+    cheetah = Cheetah(env)
+    cheetah.place(3.0, pitch)
+    _, _, terminated, _, _ = env.step(np.zeros(6, np.float32))
+    assert cheetah.pitch() == pytest.approx(pitch, abs=0.05)
+    assert not cheetah.grounded()
+    assert terminated is ends
+
+
+def test_both_cheetahs_are_alike_until_one_is_down(make):
+    falling, on = make(FALLING), make(PLAYING_ON)
+    rng = np.random.default_rng(1)
+    for seed in range(10):
+        assert_same(on.reset(seed=seed), falling.reset(seed=seed))
+        terminated = False
+        while not terminated:
+            action = rng.uniform(-1, 1, 6).astype(np.float32)
+            stock, fast = on.step(action), falling.step(action)
+            assert fast[0].tobytes() == stock[0].tobytes()
+            assert fast[1] == stock[1]
+            assert falling.unwrapped.rewards == on.unwrapped.rewards
+            assert stock[2] is False
+            terminated = fast[2]
+
+
+def test_the_falling_cheetah_is_registered_as_the_other_is(make):
+    falling, on = make(FALLING), make(PLAYING_ON)
+    assert falling.observation_space == on.observation_space
+    assert falling.action_space == on.action_space
+    assert (falling.spec.max_episode_steps, falling.spec.reward_threshold) == (1000, 3000.0)
+    assert falling.spec.id == "FastHalfCheetahPyBulletEnv-v0"
