@@ -10,8 +10,9 @@ import sys
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
+import pandas as pd
 import rich.progress
 import tyro
 from rich.console import Console
@@ -23,7 +24,7 @@ from harness.launchers.local import Outcome, cores, run_local
 from harness.progress import Progress, duration
 from harness.report.page import write_report
 from harness.report.results import Results, load_results
-from harness.schema import SuiteError, suite_names
+from harness.schema import SuiteError, Unseen, suite_names
 from harness.statistics import estimate_success, success_matrix
 from harness.store import STATES, EvaluationError, Store, StoreError
 from harness.suite import load_suite
@@ -133,39 +134,78 @@ def status(suite: tuple[str, ...] = (), results_dir: Path = Path("results")) -> 
 
 @app.command(name="evaluate")
 def evaluate(
-    run_dir: Annotated[Path, tyro.conf.Positional],
+    run_dirs: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    episodes: int = 20,
     levels: int = 500,
     repeats: int = 20,
-    unseen: Literal["next", "unbounded"] = "next",
+    unseen: Unseen = "next",
     device: str = "auto",
 ) -> None:
-    """Success rate of a CoinRun agent on its training levels and on levels it never saw.
+    """Play the final policy of trained agents, from seeds that training does not use.
 
-    Each level counts equally: sampled actions are repeated, greedy ones played once, since a level
-    is deterministic. Every episode goes to evaluation.csv in the run's folder, with a GIF of each
-    kind of level; a second call with the same settings reads it.
+    On control tasks: episodes with the policy's mean and with sampled actions, observations clean
+    and normalized as training ended, returns of raw rewards, and how smooth the actions are.
+
+    On CoinRun: the success rate on training levels and on levels that the agent never saw. Each
+    level counts equally: sampled actions are repeated, greedy ones played once, since a level is
+    deterministic. A GIF shows an episode of each kind of level.
+
+    Every episode goes to evaluation.csv in the run's folder; a second call with the same settings
+    reads it.
 
     Args:
-        run_dir: Folder of a run of ppo_reg_coinrun, with its checkpoint.pt.
-        levels: Levels of each kind; fewer than the training set has are evenly spaced in it.
-        repeats: Episodes with sampled actions on each level.
-        unseen: The levels after the training set, or ones drawn at random without bound.
-        device: cpu, cuda or cuda:1; auto: a GPU if there is one.
+        run_dirs: Folders of runs, each with its checkpoint.pt.
+        episodes: Control tasks: episodes with the policy's mean, and as many with sampled actions.
+        levels: CoinRun: levels of each kind; fewer than the training set has are evenly spaced in
+            it.
+        repeats: CoinRun: episodes with sampled actions on each level.
+        unseen: CoinRun: next are the levels after the training set, unbounded are drawn at random.
+            For agents trained with --restrict-themes, themes are the next levels without and with
+            unseen themes.
+        device: CoinRun: cpu, cuda or cuda:1; auto: a GPU if there is one.
     """
-    from harness.evaluate import evaluate_run  # imports PyTorch and the simulators
+    from harness.evaluation.runs import Settings, evaluate_run  # PyTorch and the simulators
 
+    if not run_dirs:
+        raise EvaluationError("name at least one folder of a run, such as results/smoke/<run id>")
+    settings = Settings(episodes, levels, repeats, unseen, device)
+    found: dict[str, pd.DataFrame] = {}
     with rich.progress.Progress(console=console, disable=not console.is_interactive) as bar:
+        for i, path in enumerate(run_dirs, 1):
+            name = path.resolve().name
+            if (path / "diverged.json").exists():
+                say(f"[{i}/{len(run_dirs)}] {name} diverged: it has no final policy", markup=False)
+                continue
 
-        def show(parts: Iterable[Any], total: int) -> Iterable[Any]:
-            return bar.track(parts, total, description="levels")
+            def show(parts: Iterable[Any], total: int, name: str = name) -> Iterable[Any]:
+                return bar.track(parts, total, description=name)
 
-        episodes = evaluate_run(run_dir, levels, repeats, unseen, device, show)
-    table = Table("levels", "actions", "success rate", "95% interval over levels")
-    for (split, policy), found in episodes.groupby(["split", "policy"]):
-        rate = estimate_success([success_matrix(found)])
-        interval = f"{100 * rate.low:.1f} to {100 * rate.high:.1f}"
-        table.add_row(split, policy, f"{100 * rate.mean:.1f}%", interval)
-    console.print(table)
+            found[str(path)] = evaluate_run(path, settings, show)
+            say(f"[{i}/{len(run_dirs)}] {name} evaluated", markup=False)
+    for table in evaluation_tables({Path(path).resolve().name: x for path, x in found.items()}):
+        console.print(table)
+
+
+def evaluation_tables(found: dict[str, pd.DataFrame]) -> list[Table]:
+    """What evaluations found, by run: a table of control agents, and one of CoinRun's."""
+    control = Table("run", "actions", "episodes", "return", "length", "|change|", "Sm")
+    levels = Table("run", "levels", "actions", "success rate", "95% interval over levels")
+    for run, episodes in found.items():
+        if "split" in episodes:
+            for (split, policy), part in episodes.groupby(["split", "policy"]):
+                rate = estimate_success([success_matrix(part)])
+                interval = f"{100 * rate.low:.1f} to {100 * rate.high:.1f}"
+                levels.add_row(run, split, policy, f"{100 * rate.mean:.1f}%", interval)
+            continue
+        for policy, part in episodes.groupby("policy"):
+            mean = part.mean(numeric_only=True)
+            spread = part["return"].std(ddof=0)
+            control.add_row(
+                run, policy, str(len(part)), f"{mean['return']:.1f} ± {spread:.1f}",
+                f"{mean['length']:.0f}", f"{mean['action_change']:.3f}",
+                f"{mean['smoothness']:.2e}",
+            )  # fmt: skip
+    return [table for table in (control, levels) if table.row_count]
 
 
 @app.command(name="report")
@@ -201,7 +241,7 @@ def show_others(results: Results) -> None:
     speed = {
         (run.baseline, run.environment): results.metrics[run.run_id]["charts/SPS"].iloc[-1]
         for run in results.suite.runs
-        if run.run_id in results.metrics and not run.evaluation  # too short here to tell
+        if run.run_id in results.metrics and "levels" not in run.evaluation  # too short to tell
     }
     for name in suite_names():
         if name == results.suite.name:

@@ -8,14 +8,15 @@ import tomllib
 import types
 import typing
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium as gym
 
 SUITES = Path(__file__).parent / "suites"
 RUNS = {"seeds", "agents", "args", "algorithms", "environments"}
 KEYS = RUNS | {"title", "note", "figures", "sweeps", "evaluation", "include"}
-EVALUATION = {"levels", "repeats"}
+Unseen = Literal["next", "unbounded", "themes"]
+"""what CoinRun levels are that an agent never saw: harness.evaluation.levels says more"""
 
 
 class SuiteError(ValueError):
@@ -50,9 +51,7 @@ def read(name: str) -> tuple[Path, dict[str, Any]]:
     if not data["seeds"]:
         raise SuiteError(f"{path.name}: seeds must not be empty")
     if "evaluation" in data:
-        check_keys(data["evaluation"], EVALUATION, EVALUATION, f"{path.name}: evaluation")
-        if any(type(x) is not int or x < 1 for x in data["evaluation"].values()):
-            raise SuiteError(f"{path.name}: evaluation must hold numbers of at least 1")
+        check_evaluation(data["evaluation"], f"{path.name}: evaluation")
     if "total_timesteps" not in data["args"]:
         raise SuiteError(f"{path.name}: args needs total_timesteps")
     return path, data
@@ -64,7 +63,21 @@ def check_keys(given: dict[str, Any], needed: set[str], known: set[str], where: 
         raise SuiteError(f"{where} needs the key {key!r}")
 
 
-def check_args(baseline: str, args: dict[str, Any], evaluation: dict[str, int], where: str) -> None:
+def check_evaluation(given: dict[str, Any], where: str) -> None:
+    """Raise SuiteError unless it is that of control agents, or that of CoinRun's."""
+    if "episodes" in given:
+        check_keys(given, {"episodes"}, {"episodes"}, where)
+    else:
+        check_keys(given, {"levels", "repeats"}, {"levels", "repeats", "unseen"}, where)
+    if not fits(given.get("unseen", "next"), Unseen):
+        known = " or ".join(typing.get_args(Unseen))
+        raise SuiteError(f"{where}: unseen must be {known}, got {given['unseen']!r}")
+    numbers = [value for name, value in given.items() if name != "unseen"]
+    if any(type(x) is not int or x < 1 for x in numbers):
+        raise SuiteError(f"{where} must hold numbers of at least 1")
+
+
+def check_args(baseline: str, args: dict[str, Any], evaluation: dict[str, Any], where: str) -> None:
     """Raise SuiteError unless the baseline takes these arguments and can be so evaluated."""
     try:
         module = importlib.import_module(f"baselines.{baseline}")
@@ -85,10 +98,20 @@ def check_args(baseline: str, args: dict[str, Any], evaluation: dict[str, int], 
             gym.spec(name)
     except (ValueError, gym.error.Error, ModuleNotFoundError) as error:
         raise SuiteError(f"{where}: {error}") from error
-    levels = getattr(made, "num_levels", 0)
-    if evaluation and evaluation["levels"] > levels:
+    if evaluation and has_games == ("episodes" in evaluation):
+        needs = "levels and repeats" if has_games else "episodes"
+        raise SuiteError(f"{where}: evaluation needs {needs}, got {', '.join(evaluation)}")
+    if evaluation and has_games:
+        _check_levels(made, evaluation, where)
+
+
+def _check_levels(made: Any, evaluation: dict[str, Any], where: str) -> None:
+    if evaluation["levels"] > made.num_levels:
         wants = f"{evaluation['levels']} levels to be evaluated on"
-        raise SuiteError(f"{where}: {wants}, but it is trained on {levels or 'no countable ones'}")
+        has = made.num_levels or "no countable ones"
+        raise SuiteError(f"{where}: {wants}, but it is trained on {has}")
+    if evaluation.get("unseen") == "themes" and not made.restrict_themes:
+        raise SuiteError(f"{where}: unseen = 'themes' needs restrict_themes = true in args")
 
 
 def check_known(given: dict[str, Any], known: set[str], what: str) -> None:

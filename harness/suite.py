@@ -29,8 +29,9 @@ class RunSpec:
     """module in baselines/"""
     args: dict[str, Any]
     """of the baseline: env_id, seed, agent, total_timesteps, and what the suite sets"""
-    evaluation: dict[str, int] = dataclasses.field(default_factory=dict)
-    """levels and repeats that the trained agent is evaluated on; empty for control tasks"""
+    evaluation: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """how the trained agent is evaluated: episodes of a control agent, levels and repeats of one on
+    CoinRun; empty if it is not"""
 
     @property
     def run_id(self) -> str:

@@ -60,6 +60,7 @@ def commands(group: Group, store: Store) -> list[list[str]]:
     train = [f"baselines.{baseline}", *first.flags, *more, "--run-dir", path, "--resume"]
     made = [[sys.executable, "-m", *train]]
     if first.evaluation:
+        paths = [str(store.path(spec).resolve()) for spec in group]
         flags = [word for name, x in first.evaluation.items() for word in (f"--{name}", str(x))]
-        made.append([sys.executable, "-m", "harness", "evaluate", path, *flags])
+        made.append([sys.executable, "-m", "harness", "evaluate", *paths, *flags])
     return made

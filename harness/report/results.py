@@ -22,13 +22,14 @@ class Results:
     done: list[str]
     """ids of runs that are complete"""
     evaluations: dict[str, pd.DataFrame]
-    """episodes on seen and unseen levels, by run id, of the runs that were evaluated"""
+    """episodes of the final policy, by run id, of the runs that were evaluated: on seen and unseen
+    levels, or on a control task"""
     folders: dict[str, Path]
     """where each run's files are, by run id"""
 
     def part(self, evaluated: bool) -> Results:
         """The runs that are evaluated on levels, or the others: the control tasks."""
-        runs = [run for run in self.suite.runs if bool(run.evaluation) == evaluated]
+        runs = [run for run in self.suite.runs if ("levels" in run.evaluation) == evaluated]
         named = {run.algorithm for run in runs}
         tasks = {run.environment for run in runs}
         suite = dataclasses.replace(
@@ -37,7 +38,9 @@ class Results:
             algorithms=[name for name in self.suite.algorithms if name in named],
             environments=[task for task in self.suite.environments if task in tasks],
         )
-        return dataclasses.replace(self, suite=suite)
+        ids = {run.run_id for run in runs}
+        evaluations = {run_id: x for run_id, x in self.evaluations.items() if run_id in ids}
+        return dataclasses.replace(self, suite=suite, evaluations=evaluations)
 
     def evaluations_of(self, environment: str, algorithm: str) -> dict[str, pd.DataFrame]:
         """The evaluated episodes of one algorithm's agents, by run id."""

@@ -1,4 +1,4 @@
-"""Evaluation: which levels, each as often as the others, a real agent's episodes, its files."""
+"""Evaluation on levels: which they are, each as often as the others, a real agent's episodes."""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from baselines.ppo_reg_coinrun import Agent, Args, make_env
-from harness import evaluate
-from harness.evaluate import (
+from harness.evaluation import levels as module
+from harness.evaluation.checkpoint import read_checkpoint
+from harness.evaluation.levels import (
     COLUMNS,
     Levels,
     choose_levels,
     evaluate_levels,
-    evaluate_run,
     load_agent,
     record,
 )
+from harness.evaluation.runs import Settings, evaluate_run
 from harness.store import EvaluationError
 
 ARGS = Args(num_levels=10, start_level=5, dropout=0.5)
@@ -67,7 +68,7 @@ def test_no_unseen_level_was_trained_on_and_none_counts_twice(levels, start, sha
 
 
 def test_unbounded_levels_are_drawn_again_where_they_were_trained_on(monkeypatch):
-    monkeypatch.setattr(evaluate, "MAX_SEED", 30)  # 10 of 30 are trained on
+    monkeypatch.setattr(module, "MAX_SEED", 30)  # 10 of 30 are trained on
     unseen = choose_levels(ARGS, 10, "unbounded")["unseen"]
     assert len(set(unseen)) == 10
     assert set(unseen) <= set(range(5)) | set(range(15, 30))
@@ -85,7 +86,7 @@ def test_the_unbounded_draw_is_set_by_its_seed():
         ({}, 11, "next", "levels must be from 1 to 10, got 11"),
         ({}, 0, "next", "levels must be from 1 to 10, got 0"),
         ({"num_levels": 0}, 5, "next", "levels without bound: none is unseen"),
-        ({}, 5, "later", "unseen must be next or unbounded, got 'later'"),
+        ({}, 5, "later", "unseen must be one of .*'next', 'unbounded', 'themes'.*got 'later'"),
     ],
 )
 def test_levels_that_cannot_be_had_are_refused(changed, count, unseen, message):
@@ -137,7 +138,7 @@ class OneLevel:
 
 @pytest.fixture
 def own_engine(monkeypatch):
-    monkeypatch.setattr(evaluate, "make_env", OneLevel)
+    monkeypatch.setattr(module, "make_env", OneLevel)
 
 
 @pytest.fixture
@@ -186,7 +187,7 @@ def test_the_engine_shows_each_level_in_its_place():
 def test_each_level_has_its_repeats_and_a_greedy_episode_and_only_first_ones_count(
     agent, monkeypatch
 ):
-    monkeypatch.setattr(evaluate, "POOLS", 2)
+    monkeypatch.setattr(module, "POOLS", 2)
     parts = list(evaluate_levels(agent, ARGS, [4, 1, 3], repeats=3))
     assert len(parts) == 4  # two levels and one, sampled and greedy
     episodes = pd.concat(parts)
@@ -243,7 +244,7 @@ def test_an_engine_that_plays_another_level_is_found_out(agent, monkeypatch):
             info |= {"level_seed": info["level_seed"] + 1} if "level_seed" in info else {}
             return *results, info
 
-    monkeypatch.setattr(evaluate, "make_env", Other)
+    monkeypatch.setattr(module, "make_env", Other)
     with pytest.raises(AssertionError, match="other levels than it was asked for"):
         list(evaluate_levels(agent, ARGS, [2], repeats=1))
 
@@ -251,7 +252,7 @@ def test_an_engine_that_plays_another_level_is_found_out(agent, monkeypatch):
 @pytest.mark.usefixtures("own_engine")
 @pytest.mark.parametrize(("level", "frames"), [(3, 3), (50, 10)])
 def test_a_gif_ends_with_the_episode_or_at_its_longest(agent, monkeypatch, tmp_path, level, frames):
-    monkeypatch.setattr(evaluate, "GIF_FRAMES", 10)
+    monkeypatch.setattr(module, "GIF_FRAMES", 10)
     record(agent, ARGS, level, tmp_path / "seen.gif")
     with Image.open(tmp_path / "seen.gif") as picture:
         assert (picture.format, picture.size, picture.n_frames) == ("GIF", (256, 256), frames)
@@ -265,7 +266,7 @@ def evaluated(coinrun_run, tmp_path_factory) -> tuple[Path, pd.DataFrame]:
     """A real agent on two levels of each kind, twice: the folder, and what was found."""
     path = tmp_path_factory.mktemp("evaluated") / "run"
     shutil.copytree(coinrun_run[0], path)
-    return path, evaluate_run(path, levels=2, repeats=2, unseen="next", device="cpu")
+    return path, evaluate_run(path, Settings(levels=2, repeats=2, device="cpu"))
 
 
 def test_a_real_agent_plays_every_level_as_often(evaluated):
@@ -295,160 +296,92 @@ def test_what_a_real_agent_did_is_written(evaluated):
             assert picture.n_frames > 1
 
 
-class Quick:
-    """Stands in for playing: a row for each level and policy, and how often it was asked."""
-
-    def __init__(self, monkeypatch) -> None:
-        self.calls: list[list[int]] = []
-        self.recorded: list[tuple[str, int]] = []
-        monkeypatch.setattr(evaluate, "evaluate_levels", self.play)
-        monkeypatch.setattr(evaluate, "record", self.record)
-
-    def play(self, agent, args, levels, repeats):
-        self.calls.append(levels)
-        for policy, times in (("sampled", repeats), ("greedy", 1)):
-            places = {"level": np.repeat(levels, times), "repeat": [*range(times)] * len(levels)}
-            found = {"success": True, "return": 10.0, "length": 7}
-            yield pd.DataFrame({**places, "policy": policy, **found})
-
-    def record(self, agent, args, level, path):
-        self.recorded.append((path.name, level))
-
-
-@pytest.fixture
-def quick(monkeypatch) -> Quick:
-    return Quick(monkeypatch)
-
-
-@pytest.fixture
-def path(coinrun_run, tmp_path) -> Path:
-    """A copy of the trained run."""
-    return Path(shutil.copytree(coinrun_run[0], tmp_path / "run"))
-
-
-def judge(path: Path, levels: int = 2, repeats: int = 2, unseen: str = "next") -> pd.DataFrame:
-    return evaluate_run(path, levels, repeats, unseen, "cpu")
-
-
-def test_a_second_call_reads_what_the_first_found(path, quick):
-    first = judge(path)
-    assert quick.calls == [[0, 250], [500, 750]]
-    assert quick.recorded == [("seen.gif", 0), ("unseen.gif", 500)]
-    pd.testing.assert_frame_equal(judge(path), first)
-    assert len(quick.calls) == 2
-
-
-@pytest.mark.parametrize("changed", [{"levels": 3}, {"repeats": 1}, {"unseen": "unbounded"}])
-def test_other_settings_are_played(path, quick, changed):
-    judge(path)
-    judge(path, **changed)
-    assert len(quick.calls) == 4
-    pd.testing.assert_frame_equal(judge(path, **changed), pd.read_csv(path / "evaluation.csv"))
-    assert len(quick.calls) == 4
-
-
-def test_another_checkpoint_is_played(path, quick):
-    judge(path)
-    saved = torch.load(path / "checkpoint.pt", weights_only=True)
-    saved["learner"]["agent"]["policy.bias"] += 1
-    torch.save(saved, path / "checkpoint.pt")
-    judge(path)
-    assert len(quick.calls) == 4
-
-
-def test_the_evaluation_of_a_suites_run_is_not_overwritten(path, quick):
-    first = judge(path)
-    (path / "done.json").write_text("{}")
-    with pytest.raises(EvaluationError, match=r"a suite's run, evaluated with .*: copy it"):
-        judge(path, repeats=1)
-    pd.testing.assert_frame_equal(judge(path), first)
-    (path / "evaluation.csv").unlink()
-    judge(path)  # lost, and so made again
-    assert len(quick.calls) == 4
-
-
-def test_what_is_killed_before_its_last_file_is_played_again(path, quick, monkeypatch):
-    judge(path)
-
-    def killed(*_):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(evaluate, "write_json", killed)
-        with pytest.raises(KeyboardInterrupt):
-            judge(path, repeats=1)
-    assert not (path / "evaluation.json").exists()
-    assert len(judge(path, repeats=2)) == 2 * 2 * 3  # not what the killed one has left
-    assert len(quick.calls) == 6
-
-
-def test_what_is_killed_while_it_plays_leaves_what_was_there(path, quick, monkeypatch):
-    before = judge(path)
-    with monkeypatch.context() as patch:
-        patch.setattr(evaluate, "record", lambda *_: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
-            judge(path, repeats=1)
-    pd.testing.assert_frame_equal(judge(path), before)
-    assert len(quick.calls) == 4
-
-
-def test_it_shows_how_far_it_is(path, quick, monkeypatch):
-    monkeypatch.setattr(evaluate, "POOLS", 500)
-    totals = []
-
-    def show(parts, total):
-        parts = list(parts)
-        totals.append((len(parts), total))
-        return parts
-
-    evaluate_run(path, 3, 1, "next", "cpu", show)
-    assert totals == [(4, 4)]
-
-
-@pytest.mark.usefixtures("quick")
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"repeats": 0}, "repeats must be at least 1, got 0"),
-        ({"levels": 501}, "levels must be from 1 to 500, got 501"),
-    ],
-)
-def test_bad_settings_are_refused(path, changed, message):
-    with pytest.raises(EvaluationError, match=message):
-        judge(path, **changed)
-    assert not (path / "evaluation.json").exists()
-
-
-def test_a_run_without_checkpoint_is_refused(tmp_path):
-    with pytest.raises(EvaluationError, match=r"holds no checkpoint\.pt: train it first"):
-        judge(tmp_path)
-
-
-@pytest.mark.parametrize("kept", [0, 100, 5000])
-def test_a_torn_checkpoint_is_refused(path, kept):
-    content = (path / "checkpoint.pt").read_bytes()
-    (path / "checkpoint.pt").write_bytes(content[:kept])
-    with pytest.raises(EvaluationError, match=r"checkpoint\.pt cannot be read"):
-        judge(path)
-
-
-def test_the_checkpoint_of_another_baseline_is_refused(tmp_path):
-    args = {"env_id": "HopperBulletEnv-v0", "seed": 1, "hidden_sizes": (64, 64)}
-    torch.save({"args": args, "learner": {}}, tmp_path / "checkpoint.pt")
-    with pytest.raises(EvaluationError, match="is not of ppo_reg_coinrun"):
-        judge(tmp_path)
-
-
-def test_a_device_that_is_not_there_is_refused(path):
-    with pytest.raises(EvaluationError, match="device cuda:99 cannot be used"):
-        evaluate_run(path, 2, 2, "next", "cuda:99")
-
-
-def test_the_agent_is_the_one_that_was_trained(path, coinrun_run):
-    agent, args = load_agent(path / "checkpoint.pt", "cpu")
-    spec = coinrun_run[1]
+def test_the_agent_is_the_one_that_was_trained(coinrun_run):
+    path, spec = coinrun_run
+    agent, args = load_agent(read_checkpoint(path), "cpu")
     assert {name: getattr(args, name) for name in spec.args} == spec.args
     saved = torch.load(path / "checkpoint.pt", weights_only=True)["learner"]["agent"]
     assert saved.keys() == agent.state_dict().keys()
     for name, value in agent.state_dict().items():
         torch.testing.assert_close(value, saved[name], rtol=0, atol=0)
+
+
+# --- unseen themes --------------------------------------------------------------------------------
+
+
+def test_themes_are_the_unseen_levels_once_more():
+    args = dataclasses.replace(ARGS, restrict_themes=True)
+    chosen = choose_levels(args, 3, "themes")
+    assert chosen == {"seen": [5, 8, 11], "unseen": [15, 18, 21], "themes": [15, 18, 21]}
+    assert choose_levels(args, 3, "next") == {k: chosen[k] for k in ("seen", "unseen")}
+
+
+def test_an_agent_that_saw_all_themes_is_not_tested_on_unseen_ones():
+    with pytest.raises(EvaluationError, match=r"trained with --restrict-themes.*--unseen next"):
+        choose_levels(ARGS, 3, "themes")
+
+
+@pytest.fixture
+def restricted_run(coinrun_run, tmp_path) -> Path:
+    """A run that says it was trained with one theme of each kind."""
+    path = Path(shutil.copytree(coinrun_run[0], tmp_path / "run"))
+    saved = torch.load(path / "checkpoint.pt", weights_only=True)
+    saved["args"]["restrict_themes"] = True
+    torch.save(saved, path / "checkpoint.pt")
+    return path
+
+
+def test_only_the_themes_split_is_shown_in_all_themes(restricted_run, monkeypatch):
+    played, recorded = [], []
+
+    def play(agent, args, levels, repeats):
+        played.append((levels, args.restrict_themes))
+        found = {"success": True, "return": 10.0, "length": 7}
+        yield pd.DataFrame({"level": levels, "repeat": 0, "policy": "greedy", **found})
+
+    monkeypatch.setattr(module, "evaluate_levels", play)
+    monkeypatch.setattr(
+        module, "record",
+        lambda agent, args, level, path: recorded.append((path.name, level, args.restrict_themes)),
+    )  # fmt: skip
+    totals = []
+    episodes = evaluate_run(
+        restricted_run, Settings(levels=2, unseen="themes", device="cpu"),
+        lambda parts, total: (totals.append(total), parts)[1],
+    )  # fmt: skip
+    assert played == [([0, 250], True), ([500, 750], True), ([500, 750], False)]
+    assert recorded == [
+        ("seen.gif", 0, True), ("unseen.gif", 500, True), ("themes.gif", 500, False)
+    ]  # fmt: skip
+    found = episodes[["split", "level"]].to_numpy().tolist()
+    assert found == [["seen", 0], ["seen", 250], ["themes", 500], ["themes", 750],
+                     ["unseen", 500], ["unseen", 750]]  # fmt: skip
+    assert totals == [3 * 2]  # splits, kinds of actions
+    about = json.loads((restricted_run / "evaluation.json").read_text())
+    assert about["unseen"] == "themes"
+
+
+def test_a_levels_frames_have_the_themes_that_were_asked_for():
+    frames = {}
+    for restricted in (True, False):
+        env = Levels(dataclasses.replace(ARGS, restrict_themes=restricted), [500], repeats=1)
+        frames[restricted] = env.reset(seed=0)[0]
+        env.close()
+    assert (frames[True] != frames[False]).any()
+
+
+def test_themes_change_what_a_level_looks_like_and_nothing_else():
+    """The same actions on the same levels: other frames, the same rewards and ends."""
+    told, seen = [], []
+    for restricted in (True, False):
+        args = dataclasses.replace(ARGS, restrict_themes=restricted)
+        env = Levels(args, list(range(8)), repeats=1)
+        rng = np.random.default_rng(0)
+        frames, _ = env.reset(seed=0)
+        seen.append(frames)
+        told.append([env.step(rng.choice([5, 7, 8], 8))[1:4] for _ in range(200)])
+        env.close()
+    np.testing.assert_array_equal(np.array(told[0]), np.array(told[1]))
+    assert np.array(told[0])[:, 1].any()  # some episodes ended
+    different = (seen[0] != seen[1]).reshape(8, -1).any(1)
+    assert different.sum() >= 6  # a level may happen to have the one theme anyway

@@ -8,10 +8,9 @@ determined by its seed and the actions: sampled actions are repeated, greedy one
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -21,7 +20,9 @@ from gymnasium.vector import VectorEnv
 from PIL import Image
 
 from baselines.ppo_reg_coinrun import Agent, Args, RunError, find_device, make_env, play
-from harness.store import EvaluationError, read_json, write_json
+from harness.evaluation.checkpoint import Checkpoint
+from harness.schema import Unseen
+from harness.store import EvaluationError
 
 POOLS = 16  # levels played at a time
 MAX_SEED = 2**31 - 1
@@ -77,30 +78,55 @@ class Levels(VectorEnv):
 
 
 def choose_levels(args: Args, count: int, unseen: str, seed: int = 0) -> dict[str, list[int]]:
-    """`count` levels of the training set, evenly spaced, and `count` that are not in it.
+    """Levels of each split: `count` of the training set, evenly spaced, and `count` beyond it.
+
+    "themes" needs an agent that was trained with `restrict_themes`, and gives three splits: `seen`
+    and `unseen` are levels as it knows them, and `themes` are the unseen levels once more, with all
+    themes. A level's layout does not depend on its themes, so the last two differ in looks alone.
+
+    That is the nearest to the test of Lee et al. (2020) that Procgen allows, not the same. There
+    the player, the ground and the background have themes from the first half of their lists in
+    training and from the second half in the test, whose levels are unbounded in number and of
+    difficulty 3 only, where training has 1 to 3. Here training has one theme each for the player,
+    the ground, the crates and the enemies, and all backgrounds; the test draws from all themes,
+    that one among them, and has levels of all difficulties.
 
     Args:
         args: Of the training run.
         count: Levels of each split.
-        unseen: "next", the levels after the training set, or "unbounded", seeds drawn at random.
+        unseen: "next", the levels after the training set; "unbounded", seeds drawn at random; or
+            "themes", the levels after the training set without and with unseen themes.
         seed: Of the random draw.
     """
+    if unseen not in get_args(Unseen):
+        raise EvaluationError(f"unseen must be one of {get_args(Unseen)}, got {unseen!r}")
     if args.num_levels == 0:
         raise EvaluationError("the agent was trained on levels without bound: none is unseen")
     if not 1 <= count <= args.num_levels:
         raise EvaluationError(f"levels must be from 1 to {args.num_levels}, got {count}")
+    if unseen == "themes" and not args.restrict_themes:
+        raise EvaluationError(
+            "unseen themes needs an agent that was trained with --restrict-themes: this one has "
+            "seen all themes, so evaluate it with --unseen next or unbounded"
+        )
+
     seen = [args.start_level + i * args.num_levels // count for i in range(count)]
     trained = range(args.start_level, args.start_level + args.num_levels)
-    if unseen == "next":
-        fresh = [trained.stop + i * args.num_levels // count for i in range(count)]
-    elif unseen == "unbounded":
+    if unseen == "unbounded":
         drawn = np.random.default_rng(seed).choice(MAX_SEED, 2 * count + args.num_levels, False)
         fresh = [int(level) for level in drawn if level not in trained][:count]
     else:
-        raise EvaluationError(f"unseen must be next or unbounded, got {unseen!r}")
+        fresh = [trained.stop + i * args.num_levels // count for i in range(count)]
     if set(fresh) & set(trained):
         raise AssertionError("an unseen level was trained on")
-    return {"seen": seen, "unseen": fresh}
+
+    splits = {"seen": seen, "unseen": fresh}
+    return {**splits, "themes": fresh} if unseen == "themes" else splits
+
+
+def as_shown(args: Args, split: str) -> Args:
+    """How the levels of a split look: as in training, but for `themes`."""
+    return dataclasses.replace(args, restrict_themes=False) if split == "themes" else args
 
 
 def evaluate_levels(
@@ -121,66 +147,49 @@ def evaluate_levels(
             yield pd.DataFrame({**places, "policy": policy, **found})
 
 
-def evaluate_run(
-    path: Path, levels: int, repeats: int, unseen: str, device: str,
+def evaluate(
+    checkpoint: Checkpoint,
+    levels: int,
+    repeats: int,
+    unseen: str,
+    device: str,
     show: Callable[[Iterable, int], Iterable] = lambda parts, total: parts,
-) -> pd.DataFrame:  # fmt: skip
-    """Evaluate a run's checkpoint, once: a row for each episode, kept as evaluation.csv.
-
-    Beside it come evaluation.json, which tells when it is out of date, and seen.gif and unseen.gif.
-    """
-    if repeats < 1:
-        raise EvaluationError(f"repeats must be at least 1, got {repeats}")
+) -> pd.DataFrame:
+    """Episodes on the levels of each split, a row each; the first level's become <split>.gif."""
+    chosen = choose_levels(checkpoint.args, levels, unseen)
+    agent, args = load_agent(checkpoint, device)
     try:
-        content = (path / "checkpoint.pt").read_bytes()
-    except FileNotFoundError:
-        raise EvaluationError(f"{path} holds no checkpoint.pt: train it first") from None
-    asked = {"levels": levels, "repeats": repeats, "unseen": unseen}
-    about: dict[str, Any] = dict(asked)
-    about["checkpoint_sha256"] = hashlib.sha256(content).hexdigest()
-    kept = path / "evaluation.csv"
-    before = read_json(path / "evaluation.json") or {}
-    if before == about and kept.exists():
-        return pd.read_csv(kept)
-    known = {name: before.get(name) for name in asked}
-    if (path / "done.json").exists() and before and known != asked:
-        raise EvaluationError(
-            f"{path} is a suite's run, evaluated with {known}: copy it to evaluate it otherwise"
-        )
-    agent, args = load_agent(path / "checkpoint.pt", device)
-    chosen = choose_levels(args, levels, unseen)
-    try:
-        make_env(args, 1, args.start_level).reset()
+        env = make_env(args, 1, args.start_level)
+        env.reset()
+        env.close()
     except RunError as error:
         raise EvaluationError(str(error)) from None
-    jobs = ((split, part) for split, some in chosen.items()
-            for part in evaluate_levels(agent, args, some, repeats))  # fmt: skip
-    parts = [part.assign(split=split) for split, part in show(jobs, 4 * -(-levels // POOLS))]
+
+    jobs = (
+        part.assign(split=split)
+        for split, some in chosen.items()
+        for part in evaluate_levels(agent, as_shown(args, split), some, repeats)
+    )
+    pools = -(-levels // POOLS)
+    parts = list(show(jobs, 2 * len(chosen) * pools))
     for split, some in chosen.items():
-        record(agent, args, some[0], path / f"{split}.gif")
+        record(agent, as_shown(args, split), some[0], checkpoint.path / f"{split}.gif")
+
     episodes = pd.concat(parts)[COLUMNS].sort_values(COLUMNS[:4], ignore_index=True)
-    episodes = episodes.astype({"success": int})
-    (path / "evaluation.json").unlink(missing_ok=True)
-    episodes.to_csv(path / "evaluation.csv.tmp", index=False)
-    (path / "evaluation.csv.tmp").replace(path / "evaluation.csv")
-    write_json(path / "evaluation.json", about)
-    return episodes
+    return episodes.astype({"success": int})
 
 
-def load_agent(checkpoint: Path, device: str) -> tuple[Agent, Args]:
+def load_agent(checkpoint: Checkpoint, device: str) -> tuple[Agent, Args]:
     """The agent of a checkpoint, and the settings that it was trained with."""
-    try:
-        saved = torch.load(checkpoint, map_location="cpu", weights_only=True)
-        args = Args(**saved["args"] | {"device": device})
-    except TypeError:
-        raise EvaluationError(f"{checkpoint} is not of ppo_reg_coinrun") from None
-    except Exception as error:  # whatever a torn file makes the reader stumble over
-        raise EvaluationError(f"{checkpoint} cannot be read: {error!r}") from error
+    args = dataclasses.replace(checkpoint.args, device=device)
     try:
         agent = Agent(args, torch.Generator()).to(find_device(device))
+        agent.load_state_dict(checkpoint.learner["agent"])
     except RunError as error:
         raise EvaluationError(str(error)) from None
-    agent.load_state_dict(saved["learner"]["agent"])
+    except (KeyError, RuntimeError) as error:  # weights of another shape or version
+        what = "weights that today's ppo_reg_coinrun does not take"
+        raise EvaluationError(f"{checkpoint.path} holds {what}: {error!r}") from error
     return agent, args
 
 

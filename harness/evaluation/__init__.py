@@ -1,0 +1,1 @@
+"""What a trained agent can do: `levels` judges CoinRun's agents, `control` all others."""
