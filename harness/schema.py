@@ -65,13 +65,18 @@ def check_keys(given: dict[str, Any], needed: set[str], known: set[str], where: 
 
 def check_evaluation(given: dict[str, Any], where: str) -> None:
     """Raise SuiteError unless it is that of control agents, or that of CoinRun's."""
+    control = {"episodes"}
+    levels = {"levels", "repeats", "unseen"}
+    check_known(given, control | levels, f"{where}: key")
     if "episodes" in given:
-        check_keys(given, {"episodes"}, {"episodes"}, where)
+        check_keys(given, control, control, where)
     else:
-        check_keys(given, {"levels", "repeats"}, {"levels", "repeats", "unseen"}, where)
+        check_keys(given, levels - {"unseen"}, levels, where)
+
     if not fits(given.get("unseen", "next"), Unseen):
         known = " or ".join(typing.get_args(Unseen))
         raise SuiteError(f"{where}: unseen must be {known}, got {given['unseen']!r}")
+
     numbers = [value for name, value in given.items() if name != "unseen"]
     if any(type(x) is not int or x < 1 for x in numbers):
         raise SuiteError(f"{where} must hold numbers of at least 1")

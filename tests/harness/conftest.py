@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 
 from baselines import ppo_reg_coinrun
+from harness.evaluation.control import COLUMNS
 from harness.store import Store
 from harness.suite import RunSpec, Suite, load_suite
 
@@ -76,7 +77,8 @@ def write_run(
         returns: Mean return of each update; NaN where no episode ended.
         psi: The same for psi, or one value for all.
         columns: More columns of its metrics.
-        episodes: What it did on levels, if it was evaluated: see `make_episodes`.
+        episodes: What its evaluation found, if it has one: see `make_episodes`. By default that of
+            a control agent is two episodes of each policy, whose returns are the last of `returns`.
         done: Whether it came to its end.
     """
     store.start(spec, ["true"], [spec])
@@ -92,6 +94,8 @@ def write_run(
     )
     metrics.to_csv(store.path(spec, "metrics.csv"), index=False)
     store.path(spec, "checkpoint.pt").write_bytes(b"weights")
+    if episodes is None and "episodes" in spec.evaluation:
+        episodes = make_control_episodes([returns[-1]] * 2, [returns[-1]] * 2)
     if episodes is not None:
         episodes.to_csv(store.path(spec, "evaluation.csv"), index=False)
     if done:
@@ -111,6 +115,16 @@ def make_episodes(**successes: Sequence[Sequence[float]]) -> pd.DataFrame:
         ]
     columns = ["split", "level", "policy", "repeat", "success", "return", "length"]
     return pd.DataFrame(rows, columns=columns)
+
+
+def make_control_episodes(deterministic: Sequence[float], sampled: Sequence[float]) -> pd.DataFrame:
+    """The evaluation of a control agent with these returns."""
+    rows = [
+        (policy, episode, value, 100, 0.5, 0.001)
+        for policy, returns in (("deterministic", deterministic), ("sampled", sampled))
+        for episode, value in enumerate(returns)
+    ]
+    return pd.DataFrame(rows, columns=COLUMNS)
 
 
 COINRUN = """

@@ -9,7 +9,8 @@ import sys
 import pandas as pd
 import pytest
 
-from harness import cli, evaluate
+from harness import cli
+from harness.evaluation import runs
 from harness.launchers.local import ROOT
 from harness.schema import suite_names
 from harness.suite import load_suite
@@ -127,37 +128,92 @@ def test_seeds_beyond_the_suites_own_are_in_the_report(run_cli, store, suite_fil
     assert set(pd.read_csv(table)["seeds"]) == {2}
 
 
-def test_evaluate_says_the_rates_and_their_intervals(run_cli, monkeypatch, tmp_path):
-    episodes = make_episodes(
-        seen_sampled=[[1, 1], [1, 1]], unseen_sampled=[[0, 1], [0, 0]],
-        seen_greedy=[[1], [1]], unseen_greedy=[[0], [0]],
-    )  # fmt: skip
-    asked = []
+LEVELS = make_episodes(
+    seen_sampled=[[1, 1], [1, 1]], unseen_sampled=[[0, 1], [0, 0]],
+    seen_greedy=[[1], [1]], unseen_greedy=[[0], [0]],
+)  # fmt: skip
+CONTROL = pd.DataFrame(
+    [
+        ("deterministic", 0, 10.0, 100, 0.5, 0.001),
+        ("deterministic", 1, 20.0, 300, 0.7, 0.003),
+        ("sampled", 0, -5.0, 50, 1.0, 0.01),
+    ],
+    columns=["policy", "episode", "return", "length", "action_change", "smoothness"],
+)
 
-    def evaluate_run(*settings):
-        asked.append(settings[:-1])
-        return episodes
 
-    monkeypatch.setattr(evaluate, "evaluate_run", evaluate_run)
+@pytest.fixture
+def asked(monkeypatch):
+    """Evaluations that were asked for; each run gives what its folder's name says."""
+    found = []
+
+    def evaluate_run(path, settings, show):
+        found.append((path, settings))
+        return {"levels": LEVELS, "control": CONTROL}[path.name.split("-")[0]]
+
+    monkeypatch.setattr(runs, "evaluate_run", evaluate_run)
+    return found
+
+
+def rows(out: str) -> list[list[str]]:
+    return [line.replace("│", " ").split() for line in out.splitlines() if "│" in line]
+
+
+def test_evaluate_says_the_rates_and_their_intervals(run_cli, asked, tmp_path):
+    path = tmp_path / "levels-1"
     flags = ["--levels", 2, "--repeats", 3, "--unseen", "unbounded", "--device", "cpu"]
-    status, out = run_cli("evaluate", tmp_path, *flags)
+    status, out = run_cli("evaluate", path, *flags)
     assert status == 0, out
-    assert asked == [(tmp_path, 2, 3, "unbounded", "cpu")]
-    rows = [line.replace("│", " ").split() for line in out.splitlines() if "%" in line]
-    assert rows[1:] == [
-        ["seen", "greedy", "100.0%", "100.0", "to", "100.0"],
-        ["seen", "sampled", "100.0%", "100.0", "to", "100.0"],
-        ["unseen", "greedy", "0.0%", "0.0", "to", "0.0"],
-        ["unseen", "sampled", "25.0%", "0.0", "to", rows[4][5]],
+    settings = runs.Settings(levels=2, repeats=3, unseen="unbounded", device="cpu")
+    assert asked == [(path, settings)]
+    found = rows(out)
+    assert found == [
+        ["levels-1", "seen", "greedy", "100.0%", "100.0", "to", "100.0"],
+        ["levels-1", "seen", "sampled", "100.0%", "100.0", "to", "100.0"],
+        ["levels-1", "unseen", "greedy", "0.0%", "0.0", "to", "0.0"],
+        ["levels-1", "unseen", "sampled", "25.0%", "0.0", "to", found[3][6]],
     ]
-    run_cli("evaluate", tmp_path)
-    assert asked[1] == (tmp_path, 500, 20, "next", "auto")
+    run_cli("evaluate", path)
+    assert asked[1] == (path, runs.Settings())
+
+
+def test_evaluate_takes_several_runs_of_both_kinds(run_cli, asked, tmp_path):
+    paths = [tmp_path / name for name in ("control-1", "levels-2", "control-3")]
+    status, out = run_cli("evaluate", *paths, "--episodes", 7)
+    assert status == 0, out
+    assert asked == [(path, runs.Settings(episodes=7)) for path in paths]
+    of_control = [row for row in rows(out) if row[0].startswith("control")]
+    assert of_control == [
+        [name, *cells]
+        for name in ("control-1", "control-3")
+        for cells in (
+            ["deterministic", "2", "15.0", "±", "5.0", "200", "0.600", "2.00e-03"],
+            ["sampled", "1", "-5.0", "±", "0.0", "50", "1.000", "1.00e-02"],
+        )
+    ]
+    assert sum(row[0] == "levels-2" for row in rows(out)) == 4
+    assert "[2/3] levels-2 evaluated" in out
+
+
+def test_a_run_that_diverged_is_passed_over(run_cli, asked, tmp_path):
+    bad, good = tmp_path / "control-bad", tmp_path / "control-good"
+    bad.mkdir()
+    (bad / "diverged.json").write_text("{}")
+    status, out = run_cli("evaluate", bad, good)
+    assert status == 0, out
+    assert [path for path, _ in asked] == [good]
+    assert "control-bad diverged: it has no final policy" in out
 
 
 def test_evaluate_refuses_in_a_line(run_cli, tmp_path):
     status, out = run_cli("evaluate", tmp_path)
     assert status == 1
     assert out == f"error: {tmp_path} holds no checkpoint.pt: train it first"
+    status, out = run_cli("evaluate")
+    assert status == 1
+    assert out.startswith("error: name at least one folder of a run")
+    status, out = run_cli("evaluate", tmp_path, "--episodes", 0)
+    assert (status, out) == (1, "error: episodes must be at least 1, got 0")
 
 
 def test_status_and_list_count_the_runs_of_suites_that_include_others(run_cli, store):
@@ -207,3 +263,12 @@ def test_help_explains_every_flag():
     for flag in ("--suite", "--jobs", "--results-dir", "--total-timesteps", "--seeds", "--env"):
         assert flag in out
     assert "Ctrl-C" in out
+
+
+def test_help_of_evaluate_says_what_each_flag_is_for():
+    words = [sys.executable, "-m", "harness", "evaluate", "--help"]
+    out = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for flag in ("--episodes", "--levels", "--repeats", "--unseen", "--device"):
+        assert flag in out
+    assert "{next,unbounded,themes}" in out
+    assert "final policy" in out

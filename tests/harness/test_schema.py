@@ -110,7 +110,7 @@ def test_a_suite_needs_a_title_whatever_it_includes(tmp_path):
         ("[evaluation]", "evaluation needs the key 'levels'"),
         (
             "[evaluation]\nlevels = 2\nrepeats = 2\nunsen = 1",
-            "evaluation: key 'unsen' is unknown: levels or repeats?",
+            r"evaluation: key 'unsen' is unknown: unseen\?",
         ),
         ("[evaluation]\nlevels = 2\nrepeat = 2", "key 'repeat' is unknown: repeats?"),
         ("[evaluation]\nlevels = 0\nrepeats = 2", "must hold numbers of at least 1"),
@@ -118,6 +118,16 @@ def test_a_suite_needs_a_title_whatever_it_includes(tmp_path):
         ("[evaluation]\nlevels = 2.0\nrepeats = 2", "must hold numbers of at least 1"),
         ("[evaluation]\nlevels = 2\nrepeats = true", "must hold numbers of at least 1"),
         ("[evaluation]\nlevels = 2\nrepeats = '2'", "must hold numbers of at least 1"),
+        (
+            "[evaluation]\nlevels = 2\nrepeats = 2\nunseen = 'later'",
+            "unseen must be next or unbounded or themes, got 'later'",
+        ),
+        ("[evaluation]\nlevels = 2\nrepeats = 2\nunseen = 3", "themes, got 3"),
+        ("[evaluation]\nepisodes = 0", "must hold numbers of at least 1"),
+        ("[evaluation]\nepisodes = 2.5", "must hold numbers of at least 1"),
+        ("[evaluation]\nepisodes = 2\nlevels = 2", "key 'levels' is unknown: episodes"),
+        ("[evaluation]\nepisodes = 2\nunseen = 'next'", "key 'unseen' is unknown: episodes"),
+        ("[evaluation]\nepisode = 2", r"key 'episode' is unknown: episodes\?"),
     ],
 )
 def test_a_bad_evaluation_is_refused_and_the_reason_told(suite_file, table, message):
@@ -133,15 +143,37 @@ def test_an_evaluation_is_a_table(suite_file, value):
         read(str(suite_file))
 
 
+EPISODES, LEVELS = {"episodes": 2}, {"levels": 2, "repeats": 2}
+
+
+def test_each_kind_of_baseline_has_its_own_evaluation():
+    control = {"env_id": "Pendulum-v1", "total_timesteps": 10_000}
+    games = {"env_id": "coinrun", "total_timesteps": 10_000}
+    for baseline in ("ppo_reg", "trpo_reg"):
+        check_args(baseline, control, EPISODES, "here")
+        with pytest.raises(SuiteError, match="here: evaluation needs episodes, got levels, rep"):
+            check_args(baseline, control, LEVELS, "here")
+    for unseen in ("next", "unbounded"):
+        check_args("ppo_reg_coinrun", games, {**LEVELS, "unseen": unseen}, "here")
+    with pytest.raises(SuiteError, match="here: evaluation needs levels and repeats, got episodes"):
+        check_args("ppo_reg_coinrun", games, EPISODES, "here")
+
+
+def test_unseen_themes_need_an_agent_that_trained_without_them():
+    games, asked = {"env_id": "coinrun", "total_timesteps": 10_000}, {**LEVELS, "unseen": "themes"}
+    check_args("ppo_reg_coinrun", games | {"restrict_themes": True}, asked, "here")
+    with pytest.raises(SuiteError, match="unseen = 'themes' needs restrict_themes = true"):
+        check_args("ppo_reg_coinrun", games, asked, "here")
+
+
 @pytest.mark.parametrize(
-    ("baseline", "levels", "message"),
+    ("more", "message"),
     [
-        ("ppo_reg", 1, "1 levels to be evaluated on, but it is trained on no countable ones"),
-        ("ppo_reg_coinrun", 501, "501 levels to be evaluated on, but it is trained on 500"),
+        ({"num_levels": 1}, "2 levels to be evaluated on, but it is trained on 1"),
+        ({"num_levels": 0}, "2 levels to be evaluated on, but it is trained on no countable ones"),
     ],
 )
-def test_an_evaluation_that_cannot_be_is_refused_before_training(baseline, levels, message):
-    env_id = "coinrun" if baseline == "ppo_reg_coinrun" else "Pendulum-v1"
-    args = {"env_id": env_id, "total_timesteps": 10_000}
+def test_an_evaluation_that_cannot_be_is_refused_before_training(more, message):
+    args = {"env_id": "coinrun", "total_timesteps": 10_000} | more
     with pytest.raises(SuiteError, match=message):
-        check_args(baseline, args, {"levels": levels, "repeats": 1}, "here")
+        check_args("ppo_reg_coinrun", args, LEVELS, "here")

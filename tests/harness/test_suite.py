@@ -254,9 +254,12 @@ def test_every_suite_that_is_shipped_loads(name):
     assert {run.algorithm for run in suite.runs} == set(suite.algorithms)
 
 
+SUITES_OF_LEVELS = ("smoke_coinrun", "table2", "themes")
+
+
 def test_the_shipped_suites_are_those_of_the_study():
     control = ["ablation", "figure1", "smoke", "strong", "table1"]
-    assert suite_names() == sorted([*control, "figure4", "paper", "smoke_coinrun", "table2"])
+    assert suite_names() == sorted([*control, *SUITES_OF_LEVELS, "figure4", "paper"])
 
 
 @pytest.mark.parametrize("name", ["table1", "strong"])
@@ -267,7 +270,7 @@ def test_a_suite_that_compares_has_the_agents_that_a_verdict_needs(name):
 
 @pytest.mark.parametrize("name", ["smoke", "strong", "table1"])
 def test_the_four_algorithms_of_the_paper_differ_by_baseline_and_coefficient(name):
-    runs = {run.algorithm: run for run in load_suite(name).runs if not run.evaluation}
+    runs = {r.algorithm: r for r in load_suite(name).runs if "levels" not in r.evaluation}
     for plain, regularized in (("PPO", "PPO reg"), ("TRPO", "TRPO reg")):
         assert runs[plain].baseline == runs[regularized].baseline == f"{plain.lower()}_reg"
         without = {k: v for k, v in runs[plain].args.items() if k != "coefficient"}
@@ -451,6 +454,22 @@ def test_an_unknown_suite_is_not_included(tmp_path):
         load_suite(including(tmp_path, ["tabel1"]))
     with pytest.raises(SuiteError, match=r"union\.toml has no runs"):
         load_suite(including(tmp_path, []))
+
+
+@pytest.mark.parametrize("name", ["ablation", "figure1", "strong", "table1"])
+def test_every_control_agent_is_evaluated_over_20_episodes(name):
+    assert all(run.evaluation == {"episodes": 20} for run in load_suite(name).runs)
+
+
+def test_themes_trains_with_and_without_the_penalty_on_one_theme_of_each_kind():
+    suite = load_suite("themes")
+    assert [run.run_id for run in suite.runs] == [
+        f"{agent}__CoinRun__s{seed}__a0" for agent in ("ppo", "ppo-reg") for seed in (1, 2, 3)
+    ]
+    asked = {"levels": 500, "repeats": 5, "unseen": "themes"}
+    assert all(run.evaluation == asked for run in suite.runs)
+    assert all(run.args["restrict_themes"] for run in suite.runs)
+    assert [run.args.get("coefficient") for run in suite.runs] == [0.0] * 3 + [None] * 3
 
 
 def test_table2_is_the_papers_plan():

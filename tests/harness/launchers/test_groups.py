@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 
 import pytest
 
@@ -78,13 +79,16 @@ def test_different_settings_are_not_mixed(store):
 
 def test_the_command_of_a_group_and_of_one(store):
     runs = [run for run in table1(seeds=1, agents=3) if run.algorithm == "TRPO"]
-    (together,) = commands(runs[1:], store)
+    together, judge = commands(runs[1:], store)
     assert "baselines.trpo_reg_population" in together
     assert together[together.index("--agent") + 1] == "1"
     assert together[together.index("--num-agents") + 1] == "2"
     folder = together[together.index("--run-dir") + 1]
     paths = [str(store.path(run).resolve()) for run in runs[1:]]
     assert [folder.replace("{agent}", str(i)) for i in (1, 2)] == paths
-    (alone,) = commands(runs[:1], store)
+    assert judge == [sys.executable, "-m", "harness", "evaluate", *paths, "--episodes", "20"]
+    alone, judge = commands(runs[:1], store)
     assert "baselines.trpo_reg" in alone
     assert "--num-agents" not in alone
+    assert judge[4:] == [str(store.path(runs[0]).resolve()), "--episodes", "20"]
+    assert len(commands([dataclasses.replace(run, evaluation={}) for run in runs], store)) == 1
