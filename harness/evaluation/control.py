@@ -68,7 +68,7 @@ def episode_seeds(args: Any, episode: int) -> list[int]:
 
 def make_env(module: Any, args: Any, stats: dict[str, Any]) -> VectorEnv:
     """One clean environment, its observations normalized by frozen statistics."""
-    maker = functools.partial(module.make_env, args, 0, 0)
+    maker = functools.partial(module.make_env, args)
     env: VectorEnv = SyncVectorEnv([maker], autoreset_mode=AutoresetMode.DISABLED)
     if args.norm_obs:
         env = module.NormalizeObservation(env, stats["obs_rms"], update=False)
