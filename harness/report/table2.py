@@ -35,6 +35,12 @@ DEVIATIONS = (
     "Time limits count as ends, as in the original engine. Weights begin orthogonal. The critic's "
     "loss is not clipped; that of Lee et al. is, by the policy's clip range.",
 )
+THEMES = (
+    "These agents trained with one theme each of the player, the ground, the crates and the "
+    "enemies. Themes are the unseen levels once more, in all themes: nearest to the paper's unseen "
+    "levels, which have other themes than training throughout, backgrounds included, are unbounded "
+    "in number, and are all of difficulty 3."
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,6 +65,12 @@ class Cell:
         return f"{100 * mean:.1f} [{100 * low:.1f}, {100 * high:.1f}]" if n else "–"
 
 
+def splits(results: Results) -> tuple[str, ...]:
+    """Kinds of levels that the suite's agents are evaluated on."""
+    asked = {run.evaluation.get("unseen") for run in results.suite.runs}
+    return (*SPLITS, "themes") if "themes" in asked else SPLITS
+
+
 def make_cells(results: Results) -> list[Cell]:
     """A cell for each agent, kind of levels and kind of actions, from what has been evaluated."""
     suite, paper, cells = results.suite, paper_numbers("table2"), []
@@ -68,7 +80,7 @@ def make_cells(results: Results) -> list[Cell]:
         found = results.evaluations_of(environment, algorithm)
         metrics = results.of(environment, algorithm)
         steps = min((int(m["global_step"].iloc[-1]) for m in metrics.values()), default=0)
-        for policy, split in itertools.product(POLICIES, SPLITS):
+        for policy, split in itertools.product(POLICIES, splits(results)):
             matrices = [_matrix(episodes, split, policy) for episodes in found.values()]
             cells.append(
                 Cell(
@@ -76,7 +88,7 @@ def make_cells(results: Results) -> list[Cell]:
                     levels=matrices[0].shape[0] if matrices else 0,
                     repeats=matrices[0].shape[1] if matrices else 0,
                     planned=suite.planned[environment, algorithm], steps=steps,
-                    paper=paper[split].get(algorithm)
+                    paper=paper.get(split, {}).get(algorithm)
                     if (policy, environment) == ("sampled", PAPERS) else None,
                 )
             )  # fmt: skip
@@ -111,21 +123,24 @@ def notes(results: Results, cells: list[Cell]) -> list[str]:
     missing = sorted({c.algorithm for c in cells if c.estimate.n < c.planned})
     if missing:
         lines.append(f"Not all evaluated yet: {', '.join(missing)}.")
+    if "themes" in splits(results):
+        lines.append(THEMES)
     return lines + list(DEVIATIONS)
 
 
 def to_rows(results: Results, cells: list[Cell]) -> tuple[list[str], list[list[str]]]:
     """The table as text: a header, and a row for each agent."""
     header = ["agent"]
-    for policy, split in itertools.product(POLICIES, SPLITS):
-        paper = [f"{split}, paper"] if policy == "sampled" else []
-        header += [split if paper else f"{split}, greedy", *paper]
+    for policy, split in itertools.product(POLICIES, splits(results)):
+        header.append(split if policy == "sampled" else f"{split}, greedy")
+        header += [f"{split}, paper"] if policy == "sampled" and split in SPLITS else []
     suite, rows = results.suite, []
     for game, algorithm in itertools.product(suite.environments, suite.algorithms):
         row = [algorithm if len(suite.environments) == 1 else f"{game}: {algorithm}"]
         for cell in (c for c in cells if (c.environment, c.algorithm) == (game, algorithm)):
             paper = ["" if cell.paper is None else f"{cell.paper:.1f}"]
-            row += [cell.text, *(paper if cell.policy == "sampled" else [])]
+            row.append(cell.text)
+            row += paper if cell.policy == "sampled" and cell.split in SPLITS else []
         rows += [row] if len(row) > 1 else []
     return header, rows
 
@@ -159,11 +174,13 @@ def generalization_claim(results: Results) -> Claim:
     findings = []
     for environment, plain in itertools.product(results.suite.environments, _plain(results)):
         rates = {
-            name: {key: _rates(e) for key, e in results.pairs(environment, name).items()}
+            name: {
+                k: _rates(e, splits(results)) for k, e in results.pairs(environment, name).items()
+            }
             for name in (plain, f"{plain} reg")
         }
         both = rates[plain].keys() & rates[f"{plain} reg"].keys()
-        for split in SPLITS:
+        for split in splits(results):
             gains = [rates[f"{plain} reg"][k][split] - rates[plain][k][split] for k in sorted(both)]
             estimate = estimate_mean(np.array(gains))
             about, games = f"reg - plain: success, {split} levels", results.suite.environments
@@ -179,8 +196,8 @@ def _plain(results: Results) -> list[str]:
     return [name for name in names if f"{name} reg" in names]
 
 
-def _rates(episodes: pd.DataFrame) -> dict[str, float]:
-    return {split: float(_matrix(episodes, split, "sampled").mean()) for split in SPLITS}
+def _rates(episodes: pd.DataFrame, names: tuple[str, ...]) -> dict[str, float]:
+    return {split: float(_matrix(episodes, split, "sampled").mean()) for split in names}
 
 
 def success_curves(results: Results, path: Path) -> None:

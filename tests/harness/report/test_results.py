@@ -79,3 +79,20 @@ def test_evaluations_of_another_configuration_are_left_out(store):
     results = load_results(changed, store)
     assert results.evaluations == results.metrics == {}
     assert results.changed == [changed.runs[0].run_id]
+
+
+def test_a_part_has_its_own_runs_evaluations(store, suite_file):
+    text = suite_file.read_text().replace("[args]", "[evaluation]\nepisodes = 2\n\n[args]")
+    suite_file.write_text(text)
+    control, games = load_suite(str(suite_file)), load_suite("table2")
+    write_run(store, control.runs[0], [3.0])
+    write_run(store, games.runs[0], [1.0], episodes=EPISODES)
+    both = dataclasses.replace(control, runs=[control.runs[0], games.runs[0]])
+    results = load_results(both, store)
+    assert list(results.evaluations) == [control.runs[0].run_id, games.runs[0].run_id]
+    levels, others = (results.part(evaluated=which) for which in (True, False))
+    assert (levels.suite.runs, others.suite.runs) == ([games.runs[0]], [control.runs[0]])
+    assert list(levels.evaluations) == [games.runs[0].run_id]
+    assert list(others.evaluations) == [control.runs[0].run_id]
+    returns = others.evaluations[control.runs[0].run_id]["return"]
+    assert returns.tolist() == [3.0] * 4

@@ -14,6 +14,7 @@ from harness.report.claims import MIN_UPDATES
 from harness.report.results import load_results
 from harness.report.table2 import (
     DEVIATIONS,
+    THEMES,
     generalization_claim,
     make_cells,
     notes,
@@ -320,3 +321,46 @@ def test_each_game_has_its_columns(tmp_path, drawn):
     success_curves(results, tmp_path / "figure4.png")
     titles = [axis.get_title() for axis in drawn().axes[:2]]
     assert titles == ["CoinRun: PPO", "Maze: PPO"]
+
+
+# --- unseen themes --------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def themed(store):
+    """PPO is right in a half of the levels with all themes, PPO reg in three of four."""
+    suite = load_suite("themes", seeds=1)
+    for run in suite.runs:
+        in_all_themes = SEEN if run.algorithm == "PPO reg" else [[1, 0], [0, 1]]
+        found = [episodes(), make_episodes(themes_sampled=in_all_themes, themes_greedy=HALF)]
+        write_run(store, run, [1.0] * 3, episodes=pd.concat(found))
+    return load_results(suite, store)
+
+
+def test_themes_are_a_third_kind_of_levels_without_a_number_of_the_papers(themed):
+    cells = make_cells(themed)
+    found = {(c.algorithm, c.split): c for c in cells if c.policy == "sampled"}
+    assert found["PPO", "themes"].estimate.mean == 0.5
+    assert found["PPO reg", "themes"].estimate.mean == 0.75
+    assert found["PPO", "themes"].paper is None
+    assert found["PPO", "unseen"].paper == 14
+    header, rows = to_rows(themed, cells)
+    assert header == ["agent", "seen", "seen, paper", "unseen", "unseen, paper", "themes",
+                      "seen, greedy", "unseen, greedy", "themes, greedy"]  # fmt: skip
+    assert [len(row) for row in rows] == [len(header)] * 2
+    assert rows[0][5].startswith("50.0 [")
+    assert rows[0][4] == "14.0"
+
+
+def test_what_the_themes_are_is_said_where_there_are_any(themed, results):
+    assert notes(themed, make_cells(themed)).count(THEMES) == 1
+    assert THEMES not in notes(results, make_cells(results))
+
+
+def test_claim_d_is_judged_on_themes_too(themed):
+    found = {f.about: f.estimate.mean for f in generalization_claim(themed).findings}
+    assert found == {
+        "reg - plain: success, seen levels": 0.0,
+        "reg - plain: success, unseen levels": 0.0,
+        "reg - plain: success, themes levels": 0.25,
+    }
