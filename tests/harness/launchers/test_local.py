@@ -262,3 +262,22 @@ def test_a_trained_agent_that_was_not_evaluated_yet_only_is(store, coinrun_run):
     done = json.loads(store.path(spec, "done.json").read_text())
     assert done["sha256"]["evaluation.csv"] == hashlib.sha256(content).hexdigest()
     assert store.path(spec, "seen.gif").exists()
+
+
+def test_every_agent_of_a_group_is_evaluated(store, suite):
+    asked = {"episodes": 1}
+    group = [dataclasses.replace(spec, evaluation=asked) for spec in suite.runs[:2]]
+    assert [spec.args["agent"] for spec in group] == [0, 1]
+    progress = Progress(Console(file=io.StringIO()), store, group)
+    assert run_local([group], store, 1, progress).done == group
+    returns = []
+    for spec in group:
+        content = store.path(spec, "evaluation.csv").read_bytes()
+        done = json.loads(store.path(spec, "done.json").read_text())
+        assert done["sha256"]["evaluation.csv"] == hashlib.sha256(content).hexdigest()
+        episodes = pd.read_csv(store.path(spec, "evaluation.csv"))
+        assert episodes["policy"].tolist() == ["deterministic", "sampled"]
+        assert episodes["length"].tolist() == [200, 200]
+        returns += episodes["return"].tolist()
+    assert len(set(returns)) == 4
+    assert "[2/2] " in store.path(group[0], "log.txt").read_text()
