@@ -196,10 +196,13 @@ def load_agent(checkpoint: Checkpoint, device: str) -> tuple[Agent, Args]:
 def record(agent: Agent, args: Args, level: int, path: Path) -> None:
     """The greedy agent's episode on a level, or its first GIF_FRAMES frames, as an animated GIF."""
     env = Levels(args, [level], 1)
-    frames, pictures, device = env.reset(seed=0)[0], [], agent.device
+    frames, _ = env.reset(seed=0)
+    device = next(agent.parameters()).device
+    size = (GIF_ZOOM * 64, GIF_ZOOM * 64)
+    pictures: list[Image.Image] = []
     agent.eval()
+
     while len(pictures) < GIF_FRAMES:
-        size = (GIF_ZOOM * 64, GIF_ZOOM * 64)
         image = Image.fromarray(frames[0].transpose(1, 2, 0))
         pictures.append(image.resize(size, Image.Resampling.NEAREST))
         with torch.no_grad():
@@ -207,5 +210,6 @@ def record(agent: Agent, args: Args, level: int, path: Path) -> None:
         frames, _, ended, cut, _ = env.step(actions)
         if (ended | cut).any():
             break
+
     env.close()
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=67, loop=0)
