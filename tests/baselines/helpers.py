@@ -12,7 +12,9 @@ import sys
 import time
 from pathlib import Path
 from types import ModuleType
+from typing import ClassVar
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -183,3 +185,46 @@ def check_refusal(baseline: ModuleType, flags, message, monkeypatch, capsys, fol
     said = " ".join(f"{captured.out} {captured.err} {stopped.value}".replace("│", " ").split())
     assert message in said
     assert stopped.value.code != 0
+
+
+class Breaking(gym.Env):
+    """Random observations, rewards and ends; something is no number from a step on.
+
+    `breaks` holds that step for the environments that break, by the seed of their first reset.
+    """
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
+    action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    breaks: ClassVar[dict[int, int]] = {}
+
+    def __init__(self, what: str, number: float) -> None:
+        self.what = what
+        self.number = number
+        self.steps = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        if seed is not None:
+            self.breaks_at = self.breaks.get(seed, np.inf)
+        return self.draw(), {}
+
+    def step(self, action):
+        self.steps += 1
+        broken = self.steps >= self.breaks_at
+        obs = self.draw()
+        reward = self.np_random.normal() + float(action.sum())
+        if broken and self.what == "reward":
+            reward = self.number
+        elif broken:
+            obs[1] = self.number
+        return obs, reward, bool(self.np_random.random() < 0.05), False, {}
+
+    def draw(self):
+        return self.np_random.normal(size=3).astype(np.float32)
+
+
+NUMBERS = {"nan": np.nan, "inf": np.inf}
+for what in ("reward", "observation"):
+    for label, number in NUMBERS.items():
+        env_id = f"test/Breaking-{what}-{label}-v0"
+        gym.register(env_id, Breaking, kwargs={"what": what, "number": number})

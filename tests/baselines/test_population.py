@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import json
 import os
 import shutil
 import subprocess
@@ -18,6 +19,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from baselines import population, ppo_reg_population
 from tests.baselines.helpers import (
     FLAGS,
+    SMALL,
+    Breaking,
     check_refusal,
     interrupted,
     name,
@@ -166,8 +169,8 @@ def interrupt(module, args, monkeypatch, at_update: int) -> None:
             module.train(args)
 
 
-def check_same_runs(one, other, agents: int = 3) -> None:
-    for agent in range(agents):
+def check_same_runs(one, other, agents=range(3)) -> None:
+    for agent in agents:
         paths = [folder / f"a{agent}" for folder in (one, other)]
         assert without_speed(paths[0]) == without_speed(paths[1])
         saved = [torch.load(path / "checkpoint.pt", weights_only=True) for path in paths]
@@ -306,6 +309,166 @@ def test_the_global_random_state_is_left_alone(module, tmp_path):
     np.testing.assert_array_equal(np.random.get_state()[1], numpy_before)  # noqa: NPY002
 
 
+# --- agents that diverge -------------------------------------------------------------------------
+
+BREAKING = {**RESUMABLE, "num_agents": 3, "checkpoint_interval": 3}
+REWARD = "test/Breaking-reward-nan-v0"
+SETTINGS = {
+    "plain": {},
+    "two environments": {"num_envs": 2, "total_timesteps": 14 * 64},
+    "observed": {"env_id": "test/Breaking-observation-nan-v0"},
+    "infinite": {"env_id": "test/Breaking-reward-inf-v0"},
+    "penalized": {"coefficient": 1.0, "reduction": "batch", "perturb_obs": True},
+    "not normalized": {"norm_obs": False, "norm_reward": False, "env_id": REWARD},
+    "bounded": {"target_kl": 3e-3},
+}
+
+
+def broken(module, folder, monkeypatch, agents=(1,), steps: int = 100, **changes):
+    """Arguments of a population in which these agents break, in update 5 by default.
+
+    Updates 4 to 6 are those after the first checkpoint, in whose environments the steps count.
+    """
+    args = arguments(module, folder, **{**BREAKING, "env_id": REWARD, **changes})
+    seeds = [args.single.env_seeds(args.runs[agent], 1)[-1] for agent in agents]
+    monkeypatch.setattr(Breaking, "breaks", dict.fromkeys(seeds, steps))
+    return args
+
+
+@pytest.mark.parametrize("changes", SETTINGS.values(), ids=SETTINGS)
+@pytest.mark.parametrize("agent", [0, 1])
+def test_the_others_end_bit_for_bit_as_if_one_had_not_diverged(
+    module, tmp_path, monkeypatch, capsys, agent, changes
+):
+    settings = {"env_id": REWARD, **BREAKING, **changes}
+    undisturbed = module.train(arguments(module, tmp_path / "x", **settings))
+    args = broken(module, tmp_path / "y", monkeypatch, agents=[agent], **changes)
+    capsys.readouterr()
+    with np.errstate(all="ignore"):
+        disturbed = module.train(args)
+
+    others = [i for i in range(3) if i != agent]
+    for i in others:
+        check_close(undisturbed[i], disturbed[i], 0.0)
+    check_same_runs(tmp_path / "x", tmp_path / "y", others)
+    for i in others:
+        assert not (tmp_path / "y" / f"a{i}" / "diverged.json").exists()
+
+    what = args.env_id.split("-")[1]
+    path = tmp_path / "y" / f"a{agent}"
+    said = json.loads((path / "diverged.json").read_text())
+    message = f"the {what} became non-finite in update 5"
+    assert said == {"update": 5, "what": what, "message": message}
+    assert (
+        f"agent {agent} is frozen, the others go on: {path}: {message}" in capsys.readouterr().out
+    )
+    assert len(read_metrics(path)) == 4
+    assert torch.load(path / "checkpoint.pt", weights_only=True)["learner"]["update"] == 3
+    assert not disturbed[agent].weights.any()
+
+
+def test_an_agent_whose_weights_become_non_finite_is_frozen(module, tmp_path, monkeypatch):
+    """After an update whose numbers were finite; nor has that update a row."""
+    settings = {**BREAKING, "env_id": "test/Drift-v0"}
+    undisturbed = module.train(arguments(module, tmp_path / "x", **settings))
+    update = module.update
+
+    def spoil(args, learners, rollouts):
+        losses = update(args, learners, rollouts)
+        if learners[1].update == 4:
+            learners[1].critic[0].weight.data[0, 0] = torch.nan
+        return losses
+
+    monkeypatch.setattr(module, "update", spoil)
+    disturbed = module.train(arguments(module, tmp_path / "y", **settings))
+    for i in (0, 2):
+        check_close(undisturbed[i], disturbed[i], 0.0)
+    check_same_runs(tmp_path / "x", tmp_path / "y", (0, 2))
+    said = json.loads((tmp_path / "y" / "a1" / "diverged.json").read_text())
+    assert (said["update"], said["what"]) == (4, "loss")
+    assert len(read_metrics(tmp_path / "y" / "a1")) == 3
+
+
+@pytest.mark.parametrize("at_update", [5, 6])
+def test_an_agent_stays_frozen_when_the_population_is_resumed(
+    module, tmp_path, monkeypatch, at_update
+):
+    """From the checkpoint before it diverged, and from the one after."""
+    undisturbed = module.train(arguments(module, tmp_path / "x", **BREAKING, env_id=REWARD))
+    args = broken(module, tmp_path / "y", monkeypatch)
+    with np.errstate(all="ignore"):
+        interrupt(module, args, monkeypatch, at_update)
+    frozen = [(tmp_path / "y" / "a1" / name).read_bytes() for name in FILES]
+    resumed = module.train(dataclasses.replace(args, resume=True))
+    for i in (0, 2):
+        check_close(undisturbed[i], resumed[i], 0.0)
+    check_same_runs(tmp_path / "x", tmp_path / "y", (0, 2))
+    assert frozen == [(tmp_path / "y" / "a1" / name).read_bytes() for name in FILES]
+
+    finished = module.train(dataclasses.replace(args, resume=True))
+    assert [learner.update for learner in finished] == [7, 7, 7]
+
+
+FILES = ("metrics.csv", "checkpoint.pt", "diverged.json")
+
+
+def test_a_population_of_which_every_agent_diverges_ends_with_3(
+    module, tmp_path, monkeypatch, capsys
+):
+    args = broken(module, tmp_path, monkeypatch, agents=(0, 1, 2))
+    with np.errstate(all="ignore"), pytest.raises(args.single.DivergedError, match="every agent"):
+        module.train(args)
+    for i in range(3):
+        assert len(read_metrics(tmp_path / f"a{i}")) == 4
+
+    small = SMALL[args.single]
+    flags = [f"--{key.replace('_', '-')}={value}" for key, value in small.items()]
+    flags += [f"--env-id={REWARD}", "--num-agents=3", "--checkpoint-interval=3", "--resume"]
+    flags += [f"--run-dir={tmp_path}/a{{agent}}", "--total-timesteps=448"]
+    monkeypatch.setattr("sys.argv", ["population.py", *flags])
+    with pytest.raises(SystemExit) as stopped:
+        module.main()
+    assert stopped.value.code == 3
+    assert "every agent has diverged" in capsys.readouterr().out
+
+
+def test_agents_diverge_one_after_the_other(module, tmp_path, monkeypatch):
+    args = broken(module, tmp_path, monkeypatch, agents=(0, 2))
+    late = args.single.env_seeds(args.runs[2], 1)[0]
+    monkeypatch.setitem(Breaking.breaks, late, 150)
+    undisturbed = module.train(arguments(module, tmp_path / "x", **BREAKING, env_id=REWARD))
+    assert undisturbed
+    with np.errstate(all="ignore"):
+        module.train(args)
+    rows = [len(read_metrics(tmp_path / f"a{i}")) for i in range(3)]
+    assert rows == [4, 7, 5]
+
+
+# --- longer runs ---------------------------------------------------------------------------------
+
+
+def test_an_extended_population_is_the_longer_one_bit_for_bit(module, tmp_path):
+    settings = {"env_id": "test/Drift-v0", "checkpoint_interval": 2}
+    longer = {**settings, "total_timesteps": 6 * 64}
+    whole = module.train(arguments(module, tmp_path / "x", **longer))
+    module.train(arguments(module, tmp_path / "y", **settings, total_timesteps=4 * 64))
+    again = {**longer, "resume": True, "extend": True}
+    extended = module.train(arguments(module, tmp_path / "y", **again))
+    for one, other in zip(whole, extended, strict=True):
+        check_close(one, other, 0.0)
+    check_same_runs(tmp_path / "x", tmp_path / "y")
+
+
+def test_a_population_that_ends_between_checkpoints_cannot_be_extended(module, tmp_path):
+    args = arguments(module, tmp_path, checkpoint_interval=2)
+    module.train(args)
+    longer = dataclasses.replace(args, total_timesteps=640, resume=True)
+    with pytest.raises(args.single.RunError, match="was run with total_timesteps=320, not 640"):
+        module.train(longer)
+    with pytest.raises(args.single.RunError, match="a0 cannot be extended: its 5 updates"):
+        module.train(dataclasses.replace(longer, extend=True))
+
+
 # --- the file as a program -----------------------------------------------------------------------
 
 
@@ -342,7 +505,7 @@ def test_a_killed_process_continues_as_if_undisturbed(tmp_path):
     assert len(read_metrics(tmp_path / "killed" / "a0")) < 20
     for folder in ("killed", "undisturbed"):
         assert start(module, tmp_path, f"--run-dir={folder}/a{{agent}}", *flags).wait() == 0
-    check_same_runs(tmp_path / "killed", tmp_path / "undisturbed", agents=2)
+    check_same_runs(tmp_path / "killed", tmp_path / "undisturbed", agents=range(2))
 
 
 @pytest.mark.parametrize(

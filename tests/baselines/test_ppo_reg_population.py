@@ -19,6 +19,10 @@ CASES = {
     "penalty": {"coefficient": 0.5},
     "wide range": {"coefficient": 1e-3, "lambda_min": 0.0, "lambda_max": 0.01, "radius": 0.1},
     "gaussian": {"coefficient": 0.1, "perturbation": "gaussian"},
+    "printed sign": {"coefficient": 0.5, "printed_sign": True},
+    "one J a batch": {"coefficient": 0.5, "reduction": "batch"},
+    "above the range": {"coefficient": 0.5, "reduction": "batch", "lambda_min": 0.0,
+                        "lambda_max": 0.01, "output_gain": 1.0},
     "more of the policy": {"update_epochs": 4, "vf_epochs": 1, "ent_coef": 0.01},
     "more of the critic": {"update_epochs": 1, "vf_epochs": 4, "vf_coef": 1.0},
     "relu": {"hidden_sizes": (33, 17, 8), "activation": "relu", "log_std_init": -1.0},
@@ -26,7 +30,7 @@ CASES = {
     "annealed": {"anneal_lr": True, "num_agents": 2},
     "one": {"num_agents": 1, "agent": 4, "seed": 7},
     "bullet": {"env_id": "HopperBulletEnv-v0"},
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("changes", CASES.values(), ids=CASES)

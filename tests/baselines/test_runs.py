@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import json
 import math
 import resource
 import signal
 from pathlib import Path
 from types import ModuleType
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -16,10 +18,13 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from baselines import ppo_reg, ppo_reg_coinrun, trpo_reg
-from condwrap.spectrum import condition_number, largest_singular_value, mean_squared_singular_value
+from condwrap.probe import ConditioningProbe
 from tests.baselines.helpers import (
     ALL,
     BASELINES,
+    FLAGS,
+    OWN_FLAGS,
+    Breaking,
     Program,
     check_refusal,
     flat,
@@ -69,7 +74,7 @@ def test_coefficient_0_is_the_file_without_its_condwrap_lines(baseline, tmp_path
         for node in ast.walk(ast.parse(plain_file.read_text()))
         if isinstance(node, ast.Name)
     }
-    assert "ConditioningRegularizer" not in names
+    assert not names & {"ConditioningArgs", "PenaltyArgs"}
     plain = load_module(plain_file)
     args = short_run(baseline, tmp_path / "ours", coefficient=0.0, **changes)
     known = {field.name: getattr(args, field.name) for field in dataclasses.fields(plain.Args)}
@@ -100,67 +105,100 @@ def test_a_regularized_run_and_its_plain_twin_see_the_same_noise(baseline, tmp_p
     assert rows[0]["charts/episodic_return"] == rows[1]["charts/episodic_return"]
     for stream in learners[0].generators:
         assert torch.equal(*[learner.generators[stream].get_state() for learner in learners])
-    assert torch.equal(*[learner.probe.generator.get_state() for learner in learners])
+    assert torch.equal(*[learner.probe.yardstick.generator.get_state() for learner in learners])
     assert not torch.equal(*[learner.regularizer.generator.get_state() for learner in learners])
+
+
+class Measured(NamedTuple):
+    """A call of the probe: what it was given, its state before, and what it said."""
+
+    update: int
+    policy: Any
+    obs: torch.Tensor
+    state: dict[str, Any]
+    metrics: dict[str, float]
+
+
+@pytest.fixture
+def measured(monkeypatch):
+    """The calls of every probe, in turn."""
+    calls = []
+    measure = ConditioningProbe.measure
+
+    def spy(self, update, policy, obs):
+        state = self.state_dict()
+        metrics = measure(self, update, policy, obs)
+        calls.append(Measured(update, policy, obs.clone(), state, metrics))
+        return metrics
+
+    monkeypatch.setattr(ConditioningProbe, "measure", spy)
+    return calls
 
 
 @pytest.mark.parametrize("coefficient", [0.0, 1e-3])
 @every_baseline
-def test_psi_is_measured_once_per_update_on_the_new_policy_and_the_whole_rollout(
-    baseline, tmp_path, monkeypatch, coefficient
+def test_psi_is_measured_once_an_update_on_the_new_policy(
+    baseline, tmp_path, measured, coefficient
 ):
-    measured = []
-    measure = baseline.measure_conditioning
-
-    def spy(args, learner, obs):
-        logs = measure(args, learner, obs)
-        measured.append((obs.shape[0], weights(learner), logs))
-        return logs
-
-    monkeypatch.setattr(baseline, "measure_conditioning", spy)
     args = short_run(baseline, tmp_path, coefficient=coefficient, total_timesteps=128)
     learner = baseline.train(args)
-    assert [count for count, *_ in measured] == [64, 64]
-    assert torch.equal(measured[-1][1], weights(learner))
-    row = read_metrics(tmp_path)[-1]
-    assert float(row["conditioning/psi"]) == measured[-1][2]["conditioning/psi"]
-    low, median, high = (float(row[f"conditioning/quotient_q{q}"]) for q in ("05", "50", "95"))
-    assert 0 <= low <= median <= high
-    assert 0 <= float(row["conditioning/fraction_below"]) <= 1
-    assert float(row["conditioning/fraction_above"]) == 0.0
-
-
-def test_log_spectrum_2_writes_the_singular_values_of_every_second_policy(
-    baseline, tmp_path, monkeypatch
-):
-    expected = []
-    measure = baseline.measure_conditioning
-
-    def spy(args, learner, obs):
-        policy, states = learner.actor, obs.flatten(0, 1)
-        with torch.no_grad():
-            expected.append(
-                {
-                    "singular_value_max": largest_singular_value(policy, states).mean(),
-                    "squared_singular_value": mean_squared_singular_value(policy, states).mean(),
-                    "condition_number": condition_number(policy, states).median(),
-                }
-            )
-        return measure(args, learner, obs)
-
-    monkeypatch.setattr(baseline, "measure_conditioning", spy)
-    args = pendulum(baseline, tmp_path, env_id="HopperBulletEnv-v0", log_spectrum=2)
-    baseline.train(args)
     rows = read_metrics(tmp_path)
-    for row, values in zip(rows, expected, strict=True):
-        logged = {key: float(row[f"conditioning/{key}"]) for key in values}
-        mean = float(row["conditioning/singular_value_mean"])
-        if row in rows[1::2]:
-            # power iteration, which comes from below, is the loosest of the three
-            assert logged == pytest.approx({k: v.item() for k, v in values.items()}, rel=1e-2)
-            assert 0 < mean < logged["singular_value_max"]
-        else:
-            assert all(math.isnan(x) for x in [*logged.values(), mean])
+    assert [call.update for call in measured] == [1, 2]
+    assert [len(call.obs) for call in measured] == [64, 64]
+    for row, call in zip(rows, measured, strict=True):
+        logged = {name: float(row[name]) for name in call.metrics}
+        assert logged == pytest.approx(call.metrics, rel=1e-12, nan_ok=True)
+
+    # the policy that was measured last has the final weights, so it is measured the same now
+    last = measured[-1]
+    learner.probe.load_state_dict(last.state)
+    assert learner.probe.measure(2, last.policy, last.obs) == last.metrics
+
+
+def test_the_yardstick_is_the_papers_whatever_the_run_trains_with(baseline, tmp_path, measured):
+    settings = {"lambda_min": 0.5, "lambda_max": 3.0, "radius": 0.1, "perturbation": "gaussian"}
+    learner = baseline.train(pendulum(baseline, tmp_path, total_timesteps=64, **settings))
+    (call,) = measured
+    generator = torch.Generator()
+    generator.set_state(call.state["yardstick"]["generator"])
+    noise = torch.randn(call.obs.shape, generator=generator)
+    delta = noise / noise.norm(dim=1, keepdim=True)
+    with torch.no_grad():
+        change = learner.actor.mean(call.obs + delta) - learner.actor.mean(call.obs)
+    quotient = change.norm(dim=1)
+    psi = (1 - quotient).relu().square() + (quotient - 20).relu().square()
+    row = read_metrics(tmp_path)[0]
+    assert float(row["conditioning/psi"]) == pytest.approx(psi.mean().item(), rel=1e-4)
+    assert float(row["conditioning/own_psi"]) != pytest.approx(psi.mean().item(), rel=0.1)
+
+
+def test_log_spectrum_2_logs_the_singular_values_of_every_second_policy(
+    baseline, tmp_path, measured
+):
+    learner = baseline.train(
+        pendulum(baseline, tmp_path, env_id="HopperBulletEnv-v0", log_spectrum=2)
+    )
+    rows = read_metrics(tmp_path)
+    names = ("singular_value_max", "singular_value_mean", "condition_number")
+    for row in rows[0::2]:
+        assert all(math.isnan(float(row[f"conditioning/{name}"])) for name in names)
+    for row in rows[1::2]:
+        largest, mean, condition = (float(row[f"conditioning/{name}"]) for name in names)
+        assert 0 < mean < largest < condition
+
+    # the fifth is not due, so it is measured here, under the number of one that is
+    last = measured[-1]
+    found = learner.probe.measure(6, last.policy, last.obs)
+    jacobians = torch.func.vmap(torch.func.jacrev(learner.actor.mean))(last.obs)  # [64, 3, 15]
+    values = torch.linalg.svdvals(jacobians)
+    expected = {
+        "singular_value_max": values[:, 0].mean(),
+        "singular_value_mean": values.mean(),
+        "condition_number": (values[:, 0] / values[:, -1]).median(),
+        "frobenius_squared_per_input": jacobians.square().sum((1, 2)).mean() / 15,
+    }
+    for key, value in expected.items():
+        assert found[f"conditioning/{key}"] == pytest.approx(value.item(), rel=1e-3)
 
 
 # --- seeds ---------------------------------------------------------------------------------------
@@ -193,9 +231,8 @@ def test_every_stream_is_different(baseline, tmp_path):
     seeds = [tuple(baseline.env_seeds(a, checkpoint)) for a in args for checkpoint in range(3)]
     learners = [baseline.Learner(a) for a in args]
     generators = [g for learner in learners for g in learner.generators.values()]
-    generators += [
-        x.generator for learner in learners for x in (learner.regularizer, learner.probe)
-    ]
+    for learner in learners:
+        generators += [learner.regularizer.generator, learner.probe.yardstick.generator]
     assert len(set(seeds)) == 9
     assert len({g.initial_seed() for g in generators}) == len(generators) >= 15
 
@@ -304,6 +341,57 @@ def test_tensorboard_has_what_metrics_csv_has_after_a_resume(baseline, tmp_path,
     assert [e.value for e in events] == pytest.approx([float(r["conditioning/psi"]) for r in rows])
 
 
+LONGER = {"total_timesteps": 6 * 64, "resume": True, "extend": True}
+
+
+def test_an_extended_run_is_the_longer_run_bit_for_bit(baseline, tmp_path):
+    every = {"checkpoint_interval": 2}
+    whole = baseline.train(pendulum(baseline, tmp_path / "a", total_timesteps=6 * 64, **every))
+    baseline.train(pendulum(baseline, tmp_path / "b", total_timesteps=4 * 64, **every))
+    extended = baseline.train(pendulum(baseline, tmp_path / "b", **every, **LONGER))
+    assert torch.equal(weights(whole), weights(extended))
+    assert without_speed(tmp_path / "a") == without_speed(tmp_path / "b")
+
+
+def test_a_run_that_ends_between_checkpoints_cannot_be_extended(baseline, tmp_path):
+    every = {"checkpoint_interval": 2}
+    baseline.train(pendulum(baseline, tmp_path, **every))
+    before = (tmp_path / "metrics.csv").read_bytes()
+    with pytest.raises(baseline.RunError, match="its 5 updates are not a multiple"):
+        baseline.train(pendulum(baseline, tmp_path, **every, **LONGER))
+    assert (tmp_path / "metrics.csv").read_bytes() == before
+
+
+@pytest.mark.parametrize("number", ["nan", "inf"])
+@pytest.mark.parametrize("what", ["reward", "observation"])
+def test_a_run_that_diverges_says_so_and_stops(baseline, tmp_path, monkeypatch, what, number):
+    env_id = f"test/Breaking-{what}-{number}-v0"
+    args = pendulum(baseline, tmp_path, env_id=env_id, checkpoint_interval=2)
+    (seed,) = baseline.env_seeds(args, 1)  # that of updates 3 and 4
+    monkeypatch.setattr(Breaking, "breaks", {seed: 64 + 10})
+    with np.errstate(all="ignore"), pytest.raises(baseline.DivergedError, match=what):
+        baseline.train(args)
+    said = json.loads((tmp_path / "diverged.json").read_text())
+    message = f"the {what} became non-finite in update 4"
+    assert said == {"update": 4, "what": what, "message": message}
+    assert len(read_metrics(tmp_path)) == 3
+    saved = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    assert saved["learner"]["update"] == 2
+
+
+@every_baseline
+def test_weights_that_become_non_finite_end_the_program_with_3(
+    baseline, tmp_path, monkeypatch, capsys
+):
+    flags = [*FLAGS, *OWN_FLAGS[baseline], "--vf-coef=inf", "--total-timesteps=64"]
+    monkeypatch.setattr("sys.argv", ["baseline.py", *flags, f"--run-dir={tmp_path}"])
+    with pytest.raises(SystemExit) as stopped:
+        baseline.main()
+    assert stopped.value.code == 3
+    assert "the loss became non-finite in update 1" in capsys.readouterr().out
+    assert (tmp_path / "metrics.csv").read_text() == ""
+
+
 def test_a_checkpoint_holds_nothing_but_weights_and_numbers(baseline, tmp_path):
     baseline.train(pendulum(baseline, tmp_path))
     content = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
@@ -398,7 +486,7 @@ def test_a_full_disk_loses_nothing(baseline, tmp_path):
         (["--total-timesteps", "10"], "total_timesteps must be at least"),
         (["--coefficient", "-1"], "coefficient must be finite and at least 0, got -1.0"),
         (["--lambda-min", "30"], "lambda_min=30.0 and lambda_max=20.0"),
-        (["--perturbation", "cube"], "perturbation must be one of"),
+        (["--perturbation", "cube"], "invalid choice 'cube'"),
         (["--env-id", "CartPole-v1"], "a task with a Box of actions"),
     ],
 )

@@ -45,12 +45,16 @@ CASES = {
     "penalty": {"coefficient": 0.5},
     "wide range": {"coefficient": 0.1, "lambda_min": 0.0, "lambda_max": 0.01, "radius": 0.1},
     "uniform": {"coefficient": 0.1, "perturbation": "uniform"},
+    "printed sign": {"coefficient": 0.5, "printed_sign": True},
+    "one J a batch": {"coefficient": 0.5, "reduction": "batch"},
+    "above the range": {"coefficient": 0.5, "reduction": "batch", "lambda_min": 0.0,
+                        "lambda_max": 0.01, "output_gain": 1.0},
     "longer steps": {"target_kl": 0.05, "coefficient": 1.0},
     "few steps": {"cg_steps": 2, "vf_epochs": 1, "target_kl": 0.1},
     "environments": {"num_envs": 3, "total_timesteps": 960, "hidden_sizes": (9,)},
     "one": {"num_agents": 1, "agent": 4, "seed": 7},
     "default": {},
-}
+}  # fmt: skip
 RELU = {"hidden_sizes": (33, 17, 8), "activation": "relu", "log_std_init": -1.0}
 
 
