@@ -3,16 +3,28 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch.autograd.functional import hessian
 from torch.func import functional_call
 
-from baselines import trpo_reg
-from baselines.trpo_reg import Args, conjugate_gradient, fisher_product, gae, natural_step, update
+from baselines import ppo_reg, trpo_reg
+from baselines.trpo_reg import (
+    Args,
+    conjugate_gradient,
+    fisher_product,
+    gae,
+    line_search,
+    natural_step,
+    update,
+)
+from condwrap.settings import ConditioningArgs
 from tests.baselines.helpers import check_refusal, flat, pendulum, read_metrics
+from tests.baselines.test_ppo_reg import STANDARD, Fixed, normal_logprob
 
 # --- conjugate gradient --------------------------------------------------------------------------
 
@@ -84,6 +96,20 @@ def test_conjugate_gradient_solves_for_0_without_a_division_by_0():
     x, residual = conjugate_gradient(lambda v: matrix @ v, 0 * b, 10)
     assert x.tolist() == [0, 0, 0, 0]
     assert residual == 0
+
+
+@pytest.mark.parametrize(("spread", "products"), [(0.9e-5, 1), (1.1e-5, 2)])
+def test_conjugate_gradient_ends_once_the_residual_is_small(spread, products):
+    """After a step the residual is spread times as long as b; the bound on its square is 1e-10."""
+    diagonal = torch.tensor([1 - spread, 1 + spread], dtype=torch.float64)
+    calls = []
+
+    def product(v):
+        calls.append(v)
+        return diagonal * v
+
+    conjugate_gradient(product, torch.ones(2, dtype=torch.float64), 10)
+    assert len(calls) == products
 
 
 # --- a small problem in float64 ------------------------------------------------------------------
@@ -266,6 +292,55 @@ def test_the_parameters_share_no_memory_after_a_step():
     assert len(storages) == len(problem.parameters)
 
 
+# --- the line search -----------------------------------------------------------------------------
+
+
+def search(kl, objective=None, **changes) -> tuple[dict[str, float], float, list[float]]:
+    """A search from 0 to 1 for one number: the logs, where it ends, and what was tried."""
+    args = Args(**{"target_kl": 0.25, "line_search_shrink": 0.5, **changes})
+    number = torch.nn.Parameter(torch.zeros(1, dtype=torch.float64))
+    tried = []
+
+    def value():
+        tried.append(number.item())
+        return (objective or torch.sum)(number)
+
+    full_step = torch.ones(1, dtype=torch.float64)
+    before = torch.zeros((), dtype=torch.float64)
+    logs = line_search(args, [number], full_step, before, value, lambda: kl(number))
+    return logs, number.item(), tried
+
+
+def test_a_step_that_meets_the_bound_exactly_is_accepted():
+    logs, end, tried = search(lambda x: torch.full_like(x, 0.25).sum())
+    assert logs == {"kl": 0.25, "step_fraction": 1.0, "accepted": 1.0, "actual_improvement": 1.0}
+    assert end == 1.0
+    assert tried == [1.0]
+
+
+def test_a_step_just_beyond_the_bound_is_shortened():
+    # KL x² is 0.25 at a half: the full step is beyond it, a half meets it
+    logs, end, tried = search(lambda x: x.square().sum())
+    assert (logs["step_fraction"], logs["kl"], end) == (0.5, 0.25, 0.5)
+    assert tried == [1.0, 0.5]
+    above = math.nextafter(0.25, 1)
+    assert search(lambda x: torch.full_like(x, above).sum())[:2] == ({}, 0.0)
+
+
+def test_a_step_that_changes_nothing_is_not_accepted():
+    logs, end, tried = search(lambda x: 0 * x.sum(), objective=lambda x: 0 * x.sum())
+    assert (logs, end) == ({}, 0.0)
+    assert tried == [0.5**i for i in range(10)]
+
+
+@pytest.mark.parametrize("line_search_steps", [1, 3])
+def test_no_more_fractions_are_tried_than_said(line_search_steps):
+    beyond = {"line_search_steps": line_search_steps, "line_search_shrink": 0.25}
+    _, end, tried = search(lambda x: 1 + x.sum(), **beyond)
+    assert tried == [1.0, 0.25, 0.0625][:line_search_steps]
+    assert end == 0.0
+
+
 def nan_gradient(problem, objective, kl):
     return lambda: objective() * math.nan, kl
 
@@ -337,6 +412,129 @@ def test_a_rejected_step_leaves_the_policy_bit_for_bit_and_says_why(change, reas
 
 
 # --- an update -----------------------------------------------------------------------------------
+
+
+def by_hand(args, x, actions, advantages) -> dict[str, float]:
+    """A policy of mean 2 x and log-std 0.5 steps as `update` should step it, in float64."""
+    std = math.exp(0.5)
+    noise = (actions - 2 * x) / std
+    scaled = (advantages - advantages.mean()) / advantages.std(ddof=1)
+
+    # d log pi / d w = noise · x / std, d log pi / d log_std = noise² - 1, and J = w
+    gradient = np.array([(scaled * noise * x / std).mean(), (scaled * (noise**2 - 1)).mean()])
+    plain = np.linalg.norm(gradient)
+    gradient[0] -= args.coefficient * 2 * (2 - args.lambda_min)
+    fisher = np.array([(x**2).mean() / std**2, 2.0]) + args.cg_damping
+    direction = gradient / fisher
+    full_step = math.sqrt(2 * args.target_kl / (direction * fisher * direction).sum()) * direction
+
+    for i in range(args.line_search_steps):
+        fraction = args.line_search_shrink**i
+        w, log_std = np.array([2.0, 0.5]) + fraction * full_step
+        new = (actions - w * x) / math.exp(log_std)
+        ratio = np.exp((noise**2 - new**2) / 2 + 0.5 - log_std)
+        psi = min(w - args.lambda_min, 0) ** 2 - (2 - args.lambda_min) ** 2
+        gain = (ratio * scaled).mean() - args.coefficient * psi
+        squares = std**2 + ((w - 2) * x) ** 2
+        kl = (log_std - 0.5 + squares / (2 * math.exp(2 * log_std)) - 0.5).mean()
+        if kl <= args.target_kl and gain > 0:
+            break
+    return {
+        "w": w, "log_std": log_std, "kl": kl, "step_fraction": fraction, "accepted": 1.0,
+        "expected_improvement": (gradient * full_step).sum(), "actual_improvement": gain,
+        "cg_residual": 0.0, "share": 2 * args.coefficient * (args.lambda_min - 2) / plain,
+    }  # fmt: skip
+
+
+def small_rollout() -> trpo_reg.Rollout:
+    """Four steps, of which the third ends an episode; values 3 · obs."""
+    obs = torch.tensor([0.0, 1.0, 2.0, -1.0])[:, None]
+    column = {
+        "rewards": [1.0, -2.0, 0.5, 4.0],
+        "dones": [0.0, 0.0, 1.0, 0.0],
+        "next_values": [3.0, 6.0, 0.0, 7.0],
+    }
+    return trpo_reg.Rollout(
+        obs=obs[..., None],
+        actions=torch.tensor([0.5, 1.0, 6.0, -1.0])[:, None, None],
+        values=3 * obs,
+        next_obs=None,
+        returns=[],
+        lengths=[],
+        clean_obs=None,
+        **{name: torch.tensor(x)[:, None] for name, x in column.items()},
+    )
+
+
+def small_learner(args: Args) -> trpo_reg.Learner:
+    """Mean 2 · obs, log-std 0.5, value 3 · obs; the critic learns by plain gradient descent."""
+    learner = trpo_reg.Learner(dataclasses.replace(args, env_id="MountainCarContinuous-v0"))
+    learner.actor = Fixed()
+    learner.critic = torch.nn.Linear(1, 1, bias=False)
+    learner.critic.weight.data.fill_(3.0)
+    learner.critic_optimizer = torch.optim.SGD(learner.critic.parameters(), 0.01)
+    return learner
+
+
+SMALL_STEP = {"num_steps": 4, "num_minibatches": 1, "vf_epochs": 1, "gamma": 0.9}
+SMALL_STEP |= {"gae_lambda": 0.8, "max_grad_norm": 1e9, "vf_coef": 0.7}
+
+
+@pytest.mark.parametrize(
+    ("target_kl", "shortened"), [(0.01, False), (1.0, True)], ids=["full step", "shortened"]
+)
+def test_one_update_by_hand(target_kl, shortened):
+    args = Args(**SMALL_STEP, coefficient=0.9, lambda_min=2.5, cg_damping=0.3, target_kl=target_kl)
+    learner = small_learner(args)
+    data = small_rollout()
+    learner.update = 25
+    logs = update(args, learner, data)
+
+    x = data.obs.flatten().double().numpy()
+    actions = data.actions.flatten().double().numpy()
+    errors = [1 + 0.9 * 3 - 0, -2 + 0.9 * 6 - 3, 0.5 - 6, 4 + 0.9 * 7 + 3]
+    third = errors[2]
+    second = errors[1] + 0.72 * third
+    raw = np.array([errors[0] + 0.72 * second, second, third, errors[3]])
+    expected = by_hand(args, x, actions, raw)
+    assert (expected["step_fraction"] < 1) == shortened
+    assert learner.actor.weight.item() == pytest.approx(expected.pop("w"), rel=1e-5)
+    assert learner.actor.log_std.item() == pytest.approx(expected.pop("log_std"), rel=1e-5)
+    assert logs["conditioning/gradient_share"] == pytest.approx(expected.pop("share"), rel=1e-4)
+    for name, value in expected.items():
+        assert logs[f"losses/{name}"] == pytest.approx(value, rel=1e-4, abs=1e-5), name
+
+    targets = raw + 3 * x
+    critic_grad = 0.7 * (2 * (3 * x - targets) * x).mean()
+    assert learner.critic.weight.item() == pytest.approx(3.0 - 0.01 * critic_grad, rel=1e-5)
+    assert logs["losses/value_loss"] == pytest.approx((raw**2).mean(), rel=1e-5)
+    explained = 1 - raw.var() / targets.var()
+    assert logs["losses/explained_variance"] == pytest.approx(explained, rel=1e-4)
+    entropy = 0.5 * math.log(2 * math.pi * math.e) + 0.5  # of the old policy
+    assert logs["losses/entropy"] == pytest.approx(entropy)
+
+
+def test_the_critics_gradient_is_clipped_to_the_given_length():
+    args = Args(**{**SMALL_STEP, "max_grad_norm": 0.25})
+    learner = small_learner(args)
+    update(args, learner, small_rollout())
+    assert abs(learner.critic.weight.item() - 3.0) == pytest.approx(0.01 * 0.25, rel=1e-3)
+
+
+def test_the_surrogate_by_hand():
+    """Ratios 1.5 and 0.5; the slope is 2 and lambda_max 1.5, so psi is 0.25 in every state."""
+    args = Args(coefficient=3.0, lambda_min=0.0, lambda_max=1.5)
+    obs = torch.tensor([[1.0], [2.0]])
+    actions = torch.tensor([[1.0], [6.0]])
+    logprobs = [normal_logprob(1.0, 2.0, 0.5), normal_logprob(6.0, 4.0, 0.5)]
+    old = torch.tensor(logprobs) - torch.tensor([1.5, 0.5]).log()
+    advantages = torch.tensor([2.0, -3.0])
+    for sign, own in ((1, args), (-1, dataclasses.replace(args, printed_sign=True))):
+        learner = small_learner(own)
+        plain = trpo_reg.surrogate(learner, obs, actions, old, advantages)
+        penalized = trpo_reg.surrogate(learner, obs, actions, old, advantages, torch.ones(2, 1))
+        assert plain.item() == pytest.approx((1.5 * 2 - 0.5 * 3) / 2, rel=1e-5)
+        assert (plain - penalized).item() == pytest.approx(sign * 3.0 * 0.25, rel=1e-5)
 
 
 class Spy:
@@ -479,8 +677,39 @@ def test_more_epochs_of_the_critic_fit_it_better_and_leave_the_policy_as_it_is()
         with torch.no_grad():
             errors.append((learner.critic(data.obs).squeeze(-1) - targets).square().mean().item())
         actors.append(flat(learner.actor))
-    assert errors[1] < 0.97 * errors[0]
+    assert errors[1] < 0.8 * errors[0]
     assert torch.equal(*actors)
+
+
+# --- settings ------------------------------------------------------------------------------------
+
+
+def test_the_defaults_are_the_standard_setting():
+    """PPO's, but for the step and for what PPO alone has."""
+    own = {
+        "target_kl": 0.01,
+        "cg_steps": 10,
+        "cg_damping": 0.1,
+        "line_search_steps": 10,
+        "line_search_shrink": 0.8,
+    }
+    of_ppo_alone = {"update_epochs", "learning_rate", "anneal_lr", "clip_coef", "ent_coef"}
+    of_ppo_alone |= {"compile"}
+    expected = {k: v for k, v in STANDARD.items() if k not in of_ppo_alone}
+    conditioning = dataclasses.asdict(ConditioningArgs())
+    assert dataclasses.asdict(Args()) == {**expected, **own, **conditioning}
+
+
+def test_the_critic_is_ppos():
+    """So that claim (c) compares policies: same weights, same optimizer, same minibatches."""
+    ours = trpo_reg.Learner(Args(env_id="Pendulum-v1"))
+    theirs = ppo_reg.Learner(ppo_reg.Args(env_id="Pendulum-v1"))
+    assert torch.equal(flat(ours.critic), flat(theirs.critic))
+    assert torch.equal(flat(ours.actor), flat(theirs.actor))
+    groups = [x.critic_optimizer.state_dict()["param_groups"] for x in (ours, theirs)]
+    assert groups[0] == groups[1]
+    states = [x.generators["minibatch"].get_state() for x in (ours, theirs)]
+    assert torch.equal(*states)
 
 
 # --- runs ----------------------------------------------------------------------------------------
