@@ -12,10 +12,10 @@ import pytest
 from baselines import ppo_reg, ppo_reg_coinrun, trpo_reg
 
 ALIKE = {"Args", "Args.__post_init__", "Learner", "Learner.__init__", "update"}  # each its own
-# Images, groups of environments, one network and one optimizer; no simulator in Python, so no
-# Gymnasium wrappers, and threads.
-IMAGES = {"Learner.load_state_dict", "Learner.state_dict", "Rollout", "main"}
-IMAGES |= {"make_env", "make_envs", "rollout", "train"}
+# Images, groups of environments, one network and one optimizer, a count of valid steps and an
+# annealing horizon; no simulator in Python, so no Gymnasium wrappers, and threads.
+IMAGES = {"Learner.load_state_dict", "Learner.state_dict", "Learner.weights", "Rollout", "main"}
+IMAGES |= {"check_same", "make_env", "make_envs", "make_row", "open_logs", "rollout", "train"}
 EXCEPTIONS = {
     (ppo_reg, trpo_reg): ALIKE,
     (ppo_reg, ppo_reg_coinrun): ALIKE | IMAGES,

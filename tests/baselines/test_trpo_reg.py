@@ -76,6 +76,12 @@ def test_conjugate_gradient_stops_at_negative_curvature_with_the_x_so_far():
     assert residual == pytest.approx(6 / 7)
 
 
+def test_conjugate_gradient_stops_where_there_is_no_curvature():
+    x, residual = conjugate_gradient(lambda v: 0 * v, torch.tensor([3.0, 4.0]), 10)
+    assert x.tolist() == [0, 0]
+    assert residual == 1
+
+
 def test_conjugate_gradient_stops_at_nan_with_the_x_so_far():
     matrix, b = positive_definite(5, seed=3)
     calls = []
