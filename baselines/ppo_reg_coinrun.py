@@ -34,7 +34,6 @@ import torch
 import tyro
 from gymnasium.vector import AutoresetMode, VectorEnv
 from torch import Tensor, nn
-from torch.nn.utils import parameters_to_vector
 from torch.utils.tensorboard import SummaryWriter
 
 from condwrap.settings import PenaltyArgs  # condwrap
@@ -327,6 +326,11 @@ def make_env(args: Args, num_envs: int, start_level: int) -> Procgen:
     )
 
 
+def env_seeds(args: Args, checkpoint: int) -> list[int]:
+    sequence = np.random.SeedSequence((args.seed, args.agent, checkpoint))
+    return sequence.generate_state(args.num_envs).tolist()
+
+
 def make_envs(args: Args, checkpoint: int) -> tuple[list[Procgen], list[np.ndarray]]:
     """The groups of environments until the next checkpoint, and their first frames.
 
@@ -338,11 +342,6 @@ def make_envs(args: Args, checkpoint: int) -> tuple[list[Procgen], list[np.ndarr
     seeds = env_seeds(args, checkpoint)
     frames = [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=False)]
     return envs, frames
-
-
-def env_seeds(args: Args, checkpoint: int) -> list[int]:
-    sequence = np.random.SeedSequence((args.seed, args.agent, checkpoint))
-    return sequence.generate_state(args.num_envs).tolist()
 
 
 # --- agent ----------------------------------------------------------------------------------------
@@ -528,7 +527,7 @@ class Learner:
 
     @property
     def weights(self) -> Tensor:
-        return parameters_to_vector(self.agent.parameters())
+        return torch.cat([x.detach().flatten() for x in self.agent.parameters()])
 
     @property
     def parts(self) -> dict[str, Any]:

@@ -928,3 +928,10 @@ def test_adams_moments_follow_the_weights_memory_format(tmp_path):
             weights_.grad = torch.ones_like(weights_)
         each.optimizer.step()
     assert torch.equal(weights(learner), weights(resumed))
+
+
+def test_weights_are_checked_in_any_memory_format():
+    learner = Learner(make_args())
+    before = learner.weights
+    learner.agent.to(memory_format=torch.channels_last)
+    assert torch.equal(learner.weights, before)
