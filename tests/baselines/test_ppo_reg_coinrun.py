@@ -258,20 +258,24 @@ def test_the_first_ratios_are_1(network, dropout):
     assert parts[3] == 0  # clipped
 
 
-def test_resets_reach_no_loss(monkeypatch):
+def test_resets_reach_no_loss_and_no_log():
     """With the reset transitions' columns spoiled, the update is the same."""
     learners = []
+    logs = []
     for spoiled in (0.0, 1e6):
-        args = make_args(num_envs=2, num_groups=1, num_steps=12, num_minibatches=1)
+        changes = {"num_minibatches": 1, "anneal": False}
+        args = make_args(num_envs=2, num_groups=1, num_steps=12, **changes)
         learner, envs = Learner(args), scripted([3, 2], [4, 1])
         data = rollout(args, learner, envs, [envs[0].reset()[0]])
         assert not data.counts.all()
         for column in (data.rewards, data.values, data.logprobs):
             column[~data.counts] += spoiled
-        learner.update = 1
-        update(args, learner, data)
+        learner.update = 25  # so that the gradient share is due
+        logs.append(update(args, learner, data))
         learners.append(learner)
     assert torch.equal(*[flat(learner.agent) for learner in learners])
+    assert logs[0] == logs[1]
+    assert 0 < logs[0]["conditioning/gradient_share"] < 1
 
 
 # --- the loss ------------------------------------------------------------------------------------

@@ -134,6 +134,15 @@ def test_closing_twice_and_resetting_after_it(make):
     assert make().reset(seed=0)[0].shape == (1, 3, 64, 64)
 
 
+def test_the_engine_gets_every_setting():
+    settings = {"num_levels": 9, "start_level": 4, "paint_vel_info": False, "restrict_themes": True}
+    args = Args(env_id="maze", distribution_mode="easy", num_threads=3, **settings)
+    for num_envs, num_threads in ((2, 2), (8, 3)):  # never more threads than environments
+        env = make_env(args, num_envs, 7)
+        assert (env.task, env.num_envs) == ("MazeEasy-v0", num_envs)
+        assert env.options == {**settings, "start_level": 7, "num_threads": num_threads}
+
+
 def test_stepping_before_a_reset_is_refused(make):
     with pytest.raises(gym.error.ResetNeeded, match="reset the environments before"):
         make().step(np.zeros(1, int))
