@@ -108,6 +108,16 @@ def test_a_residual_block_by_hand():
     assert block(x).flatten().tolist() == [-0.75, 0.75, 4.25]
 
 
+def test_impala_pools_windows_of_3_that_overlap():
+    """Windows are centered on even rows and columns, so that four of them see pixel (1, 1)."""
+    pool = Agent(Args(network="impala"), seeded()).network[2]
+    x = torch.zeros(1, 1, 8, 8)
+    x[0, 0, 1, 1] = 1.0
+    expected = torch.zeros(1, 1, 4, 4)
+    expected[0, 0, :2, :2] = 1.0
+    assert torch.equal(pool(x), expected)
+
+
 # --- dropout -------------------------------------------------------------------------------------
 
 
