@@ -1,0 +1,216 @@
+"""The tests behind the claims. Every function takes leading axes: a data set, or thousands of them.
+
+A claim's tests are one family. Its headlines, which look at all tasks together, share four fifths of
+the 5%, and its single tasks the rest; by Holm's correction what is decided passes its share on. So the
+chance that a claim on which nothing is true shows any false word, wherever it stands, is at most 5%.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from harness.statistics.correlation import permuted_correlations, summarize
+from harness.statistics.families import ALPHA, holm
+from harness.statistics.signflips import (
+    POWER,
+    detectable_difference,
+    sign_flip_interval,
+    sign_flip_test,
+)
+
+HEADLINES = 0.8  # of the 5%, to a claim's headlines together
+CLAIMED = 0.8  # of a one-sided test's level; the rest can contradict the claim
+NEGLIGIBLE = 0.5  # of the plain arm's standard deviation
+
+
+class Judged(NamedTuple):
+    """Tests of one kind: arrays with an entry for each."""
+
+    mean: np.ndarray
+    low: np.ndarray
+    """95% interval, not corrected"""
+    high: np.ndarray
+    n: np.ndarray
+    p: np.ndarray
+    corrected: np.ndarray
+    """p after Holm's correction over the claim's family"""
+    word: np.ndarray
+    """1 for what the claim says, -1 for its opposite, 0 for undecided"""
+    detectable: np.ndarray
+    """the effect that would have been found with 80% power"""
+
+
+class Comparison(NamedTuple):
+    """Two arms over several tasks, for each contrast of a claim."""
+
+    headline: Judged
+    """`[..., contrasts]`: the mean over tasks, in standard deviations"""
+    tasks: Judged
+    """`[..., contrasts, tasks]`: in units of the score"""
+    negligible: np.ndarray
+    """`[..., contrasts, tasks]`: the interval is within half of the first arm's deviation"""
+    standard: np.ndarray
+    """`[..., contrasts, tasks, n]`: differences in standard deviations"""
+
+
+def compare_arms(first: np.ndarray, second: np.ndarray) -> Comparison:
+    """Second minus first arm, paired: each task by itself, and all tasks together.
+
+    A difference is measured in the standard deviation of both arms' scores on its task taken
+    together, which does not change if the two agents of a pair change places. The headline's test
+    flips the signs of all tasks of a (seed, agent) at once.
+
+    Args:
+        first: Scores `[..., contrasts, tasks, n]`; NaN where there is no such agent.
+        second: The same of the other arm; the last axis is the same (seed, agent) in both.
+    """
+    differences = second - first
+    present = ~np.isnan(differences)
+    counts = present.sum(axis=-1)
+    standard = differences / _deviation_of_both(first, second, present)[..., None]
+
+    heads = _over_tasks(standard, counts)
+    together = _flipped(heads)
+    single = _flipped(differences)
+    headline, tasks = _correct(together, single)
+
+    share = 1 / np.maximum((~np.isnan(together.p)).sum(axis=-1), 1)[..., None]
+    headline = headline._replace(
+        detectable=detectable_difference(_deviation(heads), headline.n, share)
+    )
+    share = 1 / np.maximum((~np.isnan(single.p)).sum(axis=(-2, -1)), 1)[..., None, None]
+    tasks = tasks._replace(
+        detectable=detectable_difference(_deviation(differences), counts, share)
+    )
+
+    bound = NEGLIGIBLE * _deviation(np.where(present, first, np.nan))
+    negligible = (tasks.low >= -bound) & (tasks.high <= bound) & (bound > 0)
+    return Comparison(headline, tasks, negligible, standard)
+
+
+def _over_tasks(standard: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Each (seed, agent)'s part of the mean over tasks of the standardized mean difference."""
+    present = ~np.isnan(standard)
+    somewhere = present.any(axis=-2)
+    agents = somewhere.sum(axis=-1)
+    tasks = np.maximum((counts > 0).sum(axis=-1), 1)
+
+    weights = agents[..., None] / np.maximum(counts, 1) / tasks[..., None]
+    parts = (np.nan_to_num(standard) * weights[..., None]).sum(axis=-2)
+    return np.where(somewhere, parts, np.nan)
+
+
+def _flipped(differences: np.ndarray) -> Judged:
+    """Sign-flip test and interval of differences over their last axis."""
+    counts = (~np.isnan(differences)).sum(axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.nansum(differences, axis=-1) / counts
+    low, high = sign_flip_interval(differences)
+    p = sign_flip_test(differences)
+    return Judged(mean, low, high, counts, p, p, np.sign(mean), np.full(p.shape, np.nan))
+
+
+def _correct(headline: Judged, tasks: Judged) -> tuple[Judged, Judged]:
+    """Holm's correction over the headlines and all tasks of a claim, and the words that it allows.
+
+    Args:
+        headline: Tests `[..., contrasts]`, whose `word` is the direction found.
+        tasks: Tests `[..., contrasts, tasks]`.
+    """
+    shape = tasks.p.shape[-2:]
+    single = tasks.p.reshape(*tasks.p.shape[:-2], -1)
+    tests = np.concatenate([headline.p, single], axis=-1)
+    corrected = holm(tests, _weights(headline.p, single))
+
+    of_headlines = corrected[..., : headline.p.shape[-1]]
+    of_tasks = corrected[..., headline.p.shape[-1] :].reshape(*single.shape[:-1], *shape)
+    return _called(headline, of_headlines), _called(tasks, of_tasks)
+
+
+def _weights(headlines: np.ndarray, tasks: np.ndarray) -> np.ndarray:
+    """Shares of the level, `[..., headlines + tasks]`, each kind's split evenly."""
+    kinds = ((headlines, HEADLINES), (tasks, 1 - HEADLINES))
+    shares = [
+        np.broadcast_to(
+            share / np.maximum((~np.isnan(p)).sum(axis=-1, keepdims=True), 1), p.shape
+        )
+        for p, share in kinds
+    ]
+    return np.concatenate(shares, axis=-1)
+
+
+def _called(judged: Judged, corrected: np.ndarray) -> Judged:
+    word = np.where(corrected <= ALPHA, judged.word, 0)
+    return judged._replace(corrected=corrected, word=np.nan_to_num(word).astype(int))
+
+
+def _deviation(values: np.ndarray) -> np.ndarray:
+    """Standard deviation of the last axis without NaN entries; NaN for fewer than two."""
+    present = ~np.isnan(values)
+    counts = present.sum(axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.nansum(values, axis=-1, keepdims=True) / counts[..., None]
+        squares = np.where(present, (values - mean) ** 2, 0.0).sum(axis=-1)
+        return np.sqrt(np.where(counts > 1, squares / (counts - 1), np.nan))
+
+
+def _deviation_of_both(first: np.ndarray, second: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Standard deviation of both arms' scores together; 1 where all are equal."""
+    both = np.concatenate([first, second], axis=-1)
+    both = np.where(np.concatenate([present, present], axis=-1), both, np.nan)
+    deviation = _deviation(both)
+    return np.where(deviation > 0, deviation, 1.0)
+
+
+class Association(NamedTuple):
+    """Rank correlations of psi and score, for each part of claim (a)."""
+
+    headline: Judged
+    """`[..., parts]`: over all settings"""
+    tasks: Judged
+    """`[..., parts, tasks]`: over the settings of a task"""
+
+
+def associate(psi: np.ndarray, score: np.ndarray, tasks: np.ndarray) -> Association:
+    """Spearman's correlation of psi and score within settings, averaged over settings.
+
+    The claim says that it is negative. Its test is one-sided but for a fifth of the level, which
+    can contradict it. Agents are permuted alike in all settings, since these share seeds.
+
+    Args:
+        psi: Numbers of the agents, `[..., parts, settings, n]`; parts are psi late and psi early.
+        score: Their scores, `[..., settings, n]`.
+        tasks: The task of each setting, `[settings]`: numbers from 0.
+    """
+    agents = score.shape[-1]
+    parts = np.broadcast_to(score[..., None, :, :], psi.shape)
+    found = [
+        permuted_correlations(psi[..., tasks == task, :], parts[..., tasks == task, :])
+        for task in range(max(tasks) + 1)
+    ]
+    sums = np.stack([total for total, _ in found], axis=-2)
+    settings = np.stack([count for _, count in found], axis=-1)
+
+    headline, single = _correct(
+        _placed(sums.sum(axis=-2), settings.sum(axis=-1), agents),
+        _placed(sums, settings, agents),
+    )
+    return Association(headline, single)
+
+
+def _placed(sums: np.ndarray, settings: np.ndarray, agents: int) -> Judged:
+    """A correlation's place among its permutations; low and high are left to the report."""
+    found = summarize(sums, settings)
+    claimed = found.below / CLAIMED
+    opposite = found.above / (1 - CLAIMED)
+    p = np.minimum(np.minimum(claimed, opposite), 1.0)
+    word = np.where(claimed <= opposite, 1, -1)
+
+    tests = max(p.shape[-1], 1)
+    reach = stats.norm.ppf(1 - ALPHA * CLAIMED / tests) + stats.norm.ppf(POWER)
+    none = np.full(p.shape, np.nan)
+    n = np.where(settings > 0, agents, 0)
+    return Judged(found.mean, none, none, n, p, p, word, reach * found.deviation)
