@@ -1,52 +1,96 @@
-"""Claim (e): what the penalty costs, from the speeds that the suite's own runs logged."""
+"""Claim (e): what the penalty adds to the time of a step, for each implementation by itself."""
 
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 
-from harness.report.claims import MIN_UPDATES, Claim, Finding, agreed, without_verdict
+from harness.report.claims.finding import (
+    CONTRADICTED,
+    SUPPORTED,
+    UNDECIDED,
+    Claim,
+    Finding,
+    agreed,
+    basis_of,
+)
+from harness.report.published import paper_numbers
 from harness.report.results import Results
-from harness.statistics import Estimate, estimate_mean, verdict
+from harness.statistics import Estimate, sign_flip_interval
 
 LIMIT = 0.1  # of the time for a step; what "inexpensive" is taken to mean
 STATEMENT = (
     "The regularizer is computationally inexpensive: it adds at most a tenth to the time that a "
     "step takes, the rest of the run included."
 )
+UNKNOWN = "unknown"
+KEYS = ["kind", "plain", "implementation", "machine", "environment", "seed"]
 
 
 def cost_claim(results: Results) -> Claim:
-    """Claim (e): for each algorithm, time for a step with the penalty over without it, less 1.
+    """Claim (e): time for a step with the penalty over without it, less 1.
 
-    A pair is a task and a seed: the agents of a seed may have shared one process, so their mean
-    counts once. The runs must have shared their machine alike for this to mean anything.
+    A pair is a task and a seed, both arms trained by one implementation on one machine: the agents
+    of a seed may have shared one process, so their mean counts once. The runs must have shared
+    their machine alike for this to mean anything; `python -m harness cost` measures it in turn.
     """
-    findings, parts = [], {"control": results.part(False), "CoinRun": results.part(True)}
-    pairs = [
-        (kind, part, name)
-        for kind, part in parts.items()
-        for name in part.suite.algorithms
-        if f"{name} reg" in part.suite.algorithms
+    times = step_times(results)
+    findings = []
+    if len(times):
+        wide = times.pivot_table(index=KEYS, columns="arm", values="seconds")
+        wide = wide.reindex(columns=["plain", "reg"]).dropna()
+        added = wide["reg"] / wide["plain"] - 1
+        for (kind, plain, implementation), group in added.groupby(KEYS[:3], sort=False):
+            about = f"reg / plain - 1: time for a step, {kind}, {implementation}"
+            findings.append(added_time(about, plain, group.to_numpy()))
+    steps = [
+        results.metrics[run.run_id]["global_step"].iloc[-1]
+        for run in results.suite.runs
+        if run.run_id in results.done
     ]
-    for kind, part, plain in pairs:
-        times, dear = _times(part, plain), _times(part, f"{plain} reg")
-        if not times.keys() & dear.keys():
-            continue
-        added = np.array([dear[key] / times[key] - 1 for key in sorted(times.keys() & dear.keys())])
-        mean, low, high, n = estimate_mean(added)
-        judged = verdict(Estimate(mean - LIMIT, low - LIMIT, high - LIMIT, n), -1)
-        about = f"reg / plain - 1: time for a step, {kind}"
-        findings.append(Finding(about, plain, Estimate(mean, low, high, n), judged))
-    claim = Claim("e", STATEMENT, agreed([f.verdict for f in findings]), findings)
-    short = any(len(results.metrics[run_id]) < MIN_UPDATES for run_id in results.done)
-    return without_verdict(claim) if short else claim
+    verdict = agreed([finding.verdict for finding in findings]) if findings else UNDECIDED
+    basis = basis_of(steps, paper_numbers("table1")["timesteps"])
+    return Claim("e", STATEMENT, verdict, findings, basis)
 
 
-def _times(results: Results, algorithm: str) -> dict[tuple[str, int], float]:
-    """Mean seconds of a step over the finished agents of each (task, seed)."""
-    found: dict[tuple[str, int], list[float]] = {}
+def added_time(about: str, algorithm: str, added: np.ndarray) -> Finding:
+    """A finding from repetitions: judged by the whole 95% interval, on one side of the limit.
+
+    The interval inverts the sign-flip test, so fewer than 6 repetitions have none.
+    """
+    low, high = (float(end) for end in sign_flip_interval(added))
+    verdict = UNDECIDED
+    if high <= LIMIT:
+        verdict = SUPPORTED
+    elif low > LIMIT:
+        verdict = CONTRADICTED
+    note = "6 pairs could decide" if np.isnan(low) else ""
+    estimate = Estimate(float(added.mean()), low, high, len(added))
+    return Finding(about, algorithm, estimate, verdict, note=note)
+
+
+def step_times(results: Results) -> pd.DataFrame:
+    """Mean seconds of a step of the finished agents of each pair, from the speeds they logged."""
+    names = results.suite.algorithms
+    arms = {name: (name, "plain") for name in names if f"{name} reg" in names}
+    arms.update({f"{name} reg": (name, "reg") for name in list(arms)})
+    rows = []
     for run in results.suite.runs:
-        if run.algorithm == algorithm and run.run_id in results.done:
-            speed = float(results.metrics[run.run_id]["charts/SPS"].iloc[-1])
-            found.setdefault((run.environment, run.args["seed"]), []).append(1 / speed)
-    return {key: float(np.mean(times)) for key, times in found.items()}
+        if run.algorithm not in arms or run.run_id not in results.done:
+            continue
+        plain, arm = arms[run.algorithm]
+        spec = results.specs.get(run.run_id, {})
+        speed = float(results.metrics[run.run_id]["charts/SPS"].iloc[-1])
+        rows.append(
+            {
+                "kind": "CoinRun" if "levels" in run.evaluation else "control",
+                "plain": plain,
+                "arm": arm,
+                "implementation": str(spec.get("implementation", UNKNOWN)),
+                "machine": str(spec.get("machine", UNKNOWN)),
+                "environment": run.environment,
+                "seed": run.args["seed"],
+                "seconds": 1 / speed,
+            }
+        )
+    return pd.DataFrame(rows, columns=[*KEYS, "arm", "seconds"])

@@ -13,7 +13,6 @@ from rich.table import Table
 from harness.report import claims, figures, study, table1, table2
 from harness.report.cost import cost_claim
 from harness.report.results import Results
-from harness.statistics import MIN_AGENTS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,9 +35,9 @@ def write_report(results: Results, folder: Path) -> tuple[list[Section], list[cl
     found, sections = [], []
     if control.suite.runs:
         found += claims.make_claims(control)
-        sections.append(_control(control, found, folder))
+        sections += [_control(control, found, folder), *_final(control, folder)]
     if levels.suite.runs:
-        claim = table2.generalization_claim(levels)
+        claim = claims.generalization_claim(levels)
         found += [claim] if claim.findings else []
         sections.append(_levels(levels, claim, folder))
     cost = cost_claim(results)
@@ -48,8 +47,7 @@ def write_report(results: Results, folder: Path) -> tuple[list[Section], list[cl
         (Path(__file__).parent / "page.html").read_text()
     )
     content = page.render(
-        suite=results.suite, claims=found, sections=sections, min_agents=MIN_AGENTS,
-        min_updates=claims.MIN_UPDATES, episodes=_episodes(levels, folder),
+        suite=results.suite, claims=found, sections=sections, episodes=_episodes(levels, folder),
     )  # fmt: skip
     (folder / "report.html").write_text(content)
     return sections, found
@@ -61,9 +59,25 @@ def _control(results: Results, found: list[claims.Claim], folder: Path) -> Secti
     table1.to_frame(cells).to_csv(folder / "table1.csv", index=False)
     header, rows = table1.to_rows(results.suite, cells)
     return Section(
-        "Table 1: mean reward over the last 100 updates, beside the paper's", header, rows,
+        "Table 1: training scores, beside the paper's", header, rows,
         table1.notes(results, cells), _draw(results, found, folder), table1.to_rich(results, cells),
     )  # fmt: skip
+
+
+def _final(results: Results, folder: Path) -> list[Section]:
+    """Table 1 once more, of the final policies, if any was evaluated."""
+    cells = table1.make_cells(results, "final")
+    if not any(cell.agents for cell in cells):
+        return []
+    (folder / "table1_final.md").write_text(table1.to_markdown(results, cells, "final"))
+    table1.to_frame(cells).to_csv(folder / "table1_final.csv", index=False)
+    header, rows = table1.to_rows(results.suite, cells)
+    return [
+        Section(
+            "Table 1: final policies", header, rows, table1.notes(results, cells), [],
+            table1.to_rich(results, cells, "final"),
+        )
+    ]  # fmt: skip
 
 
 def _levels(results: Results, claim: claims.Claim, folder: Path) -> Section:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
-from harness.store import Store
+from harness.store import Store, read_json
 from harness.suite import Suite
 
 
@@ -26,6 +27,10 @@ class Results:
     levels, or on a control task"""
     folders: dict[str, Path]
     """where each run's files are, by run id"""
+    diverged: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
+    """what became non-finite, and when, by run id: an outcome, no missing run"""
+    specs: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
+    """what each run says of itself: its implementation and its machine among it"""
 
     def part(self, evaluated: bool) -> Results:
         """The runs that are evaluated on levels, or the others: the control tasks."""
@@ -74,15 +79,25 @@ class Results:
 
 def load_results(suite: Suite, store: Store) -> Results:
     """Read what there is; runs may be unfinished, or still be running."""
-    metrics, changed, done, evaluations = {}, [], [], {}
+    metrics = {}
+    evaluations = {}
+    diverged = {}
+    specs = {}
+    changed = []
+    done = []
     for run in suite.runs:
         if store.changes(run):
             changed.append(run.run_id)
-        elif (found := store.metrics(run)) is not None:
-            metrics[run.run_id] = found
-            if store.is_done(run):
-                done.append(run.run_id)
-                if run.evaluation:
-                    evaluations[run.run_id] = pd.read_csv(store.path(run, "evaluation.csv"))
+            continue
+        specs[run.run_id] = read_json(store.path(run, "spec.json")) or {}
+        if (failure := read_json(store.path(run, "diverged.json"))) is not None:
+            diverged[run.run_id] = failure
+        if (found := store.metrics(run)) is None:
+            continue
+        metrics[run.run_id] = found
+        if store.is_done(run):
+            done.append(run.run_id)
+            if (path := store.path(run, "evaluation.csv")).exists():
+                evaluations[run.run_id] = pd.read_csv(path)
     folders = {run.run_id: store.path(run) for run in suite.runs}
-    return Results(suite, metrics, changed, done, evaluations, folders)
+    return Results(suite, metrics, changed, done, evaluations, folders, diverged, specs)

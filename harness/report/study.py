@@ -16,6 +16,10 @@ from harness.report.figures import COLORS, COLUMNS, save, tidy
 from harness.report.results import Results
 from harness.statistics import estimate_mean, spearman
 
+VERDICTS = {
+    "supported": COLORS[2], "win": COLORS[2], "contradicted": COLORS[1], "loss": COLORS[1],
+}  # fmt: skip
+
 
 def psi_and_reward(agents: pd.DataFrame, path: Path) -> None:
     """Claim (a): an agent is a point, final psi against final reward, a panel for each task."""
@@ -51,7 +55,7 @@ def findings(claim: Claim, path: Path) -> None:
         tidy(axis)
         for y, finding in enumerate(reversed(found)):
             mean, low, high, n = finding.estimate
-            color = {"supported": COLORS[2], "contradicted": COLORS[1]}.get(finding.verdict, "gray")
+            color = VERDICTS.get(finding.verdict, "gray")
             if not np.isnan(low):
                 axis.plot([low, high], [y, y], color=color, linewidth=2)
             axis.plot(mean, y, "o", color=color, markersize=5)
@@ -87,8 +91,7 @@ def quotient_and_spectrum(results: Results, path: Path) -> bool:
         axis.scatter(exact, quotient, c=steps, cmap="viridis", s=10)
         end = max(exact.max(), quotient.max())
         axis.plot([0, end], [0, end], color="gray", linewidth=0.8, linestyle="--")
-        pairs = np.column_stack([exact, quotient])
-        rank = spearman(pairs[None])[0] if len(pairs) > 2 else np.nan
+        rank = spearman(exact.to_numpy(), quotient.to_numpy()) if len(exact) > 2 else np.nan
         axis.set_title(f"{task}: rank correlation {rank:.2f}", fontsize=10)
         axis.set_xlabel("mean singular value")
         axis.set_ylabel("median J")

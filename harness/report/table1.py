@@ -1,4 +1,4 @@
-"""Table 1: mean reward over the last 100 updates, beside the paper's numbers."""
+"""Table 1, twice: training scores beside the paper's, and the returns of the final policies."""
 
 from __future__ import annotations
 
@@ -10,11 +10,25 @@ import numpy as np
 import pandas as pd
 from rich.table import Table
 
-from harness.report.markdown import to_markdown_table
-from harness.report.paper import paper_numbers
+from harness.report.claims.agents import agent_table, fill_failed
+from harness.report.markdown import supported_by, to_markdown_table
+from harness.report.published import paper_numbers, zoo_numbers
 from harness.report.results import Results
-from harness.statistics import LAST_UPDATES, Estimate, estimate_mean, final_score
+from harness.statistics import (
+    Estimate,
+    detectable_difference,
+    estimate_mean,
+    is_skewed,
+    window_of,
+)
 from harness.suite import Suite
+
+OUTCOMES = {
+    "reward": "training score: mean return of the episodes that ended in the last tenth of the "
+    "run, at most 200,000 steps",
+    "final": "final policy: mean return of its deterministic actions over the evaluation",
+}
+BESIDE_ZOO = ("strong",)  # suites with rl-baselines3-zoo's settings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,77 +38,133 @@ class Cell:
     environment: str
     algorithm: str
     estimate: Estimate
+    scores: tuple[float, ...]
+    """one for each agent, ordered by size"""
     seeds: int
     agents: int
-    """agents with a finished episode, over all seeds"""
+    """agents with a score, over all seeds; failed ones have the worst of their task"""
+    failed: int
+    """agents whose own numbers became non-finite"""
     planned: int
     """agents in the suite"""
     steps: int
     """environment steps of the agent that has done the fewest"""
-    updates: int
-    """updates that the mean of the agent with the fewest is over"""
+    window: int
+    """steps at the end of the run that the training score is over"""
+    detectable: float
+    """difference to an arm of this spread that would have been found with 80% power, unpaired"""
     paper: float | None
+    zoo: str
+    """mean and deviation of rl-baselines3-zoo's agent, where it stands beside"""
 
     @property
     def text(self) -> str:
-        """The mean and its interval, or a dash where there is no run."""
+        """The mean, its interval or its range, and what it rests on; a dash if there is no run."""
         mean, low, high, _ = self.estimate
-        if np.isnan(mean):
+        if not self.agents:
             return "–"
-        return f"{mean:.1f}" if np.isnan(low) else f"{mean:.1f} [{low:.1f}, {high:.1f}]"
+        spread = ""
+        if not np.isnan(low):
+            spread = f" [{low:.1f}, {high:.1f}]"
+        elif self.agents > 1:
+            spread = f" {{{self.scores[0]:.1f} to {self.scores[-1]:.1f}}}"
+        return f"{mean:.1f}{spread} {supported_by(self.agents, self.failed, self.detectable)}"
 
 
-def make_cells(results: Results) -> list[Cell]:
-    """A cell for each environment and algorithm, from whatever has been run so far."""
-    suite, paper = results.suite, paper_numbers("table1")
-    algorithms = [a for a in suite.algorithms if a in paper] or suite.algorithms
+def make_cells(results: Results, outcome: str = "reward") -> list[Cell]:
+    """A cell for each environment and algorithm, from whatever has been run so far.
+
+    Args:
+        results: What the runs have left.
+        outcome: "reward" for training scores, "final" for final policies.
+    """
+    suite = results.suite
+    paper = paper_numbers("table1") if outcome == "reward" else {}
+    named = paper_numbers("table1")
+    algorithms = [name for name in suite.algorithms if name in named] or suite.algorithms
+    agents = agent_table(results)
+    agents = fill_failed(agents[agents["algorithm"].isin(algorithms)], outcome)
     planned = suite.planned
-    seeds = {run.run_id: run.args["seed"] for run in suite.runs}
     cells = []
     for environment, algorithm in itertools.product(suite.environments, algorithms):
         if not planned[environment, algorithm]:
             continue
-        found = results.of(environment, algorithm)
-        scores = {k: final_score(m) for k, m in found.items()}
-        scores = {k: score for k, score in scores.items() if not np.isnan(score)}
+        of_task = agents[agents["environment"] == environment]
+        own = of_task[of_task["algorithm"] == algorithm]
+        scored = own.dropna(subset=[outcome])
+        arms = [arm.dropna().to_numpy() for _, arm in of_task.groupby("algorithm")[outcome]]
+        scores = np.sort(scored[outcome].to_numpy(float))
+        spread = float(scores.std(ddof=1)) if len(scores) > 1 else np.nan
+        zoo = zoo_numbers(algorithm).get(environment)
+        beside = outcome == "final" and suite.name in BESIDE_ZOO and zoo is not None
         cells.append(
             Cell(
                 environment=environment,
                 algorithm=algorithm,
-                estimate=estimate_mean(np.array(list(scores.values()))),
-                seeds=len({seeds[k] for k in scores}),
-                agents=len(scores),
+                estimate=estimate_mean(scores, skewed=is_skewed(arms)),
+                scores=tuple(float(score) for score in scores),
+                seeds=scored["seed"].nunique(),
+                agents=len(scored),
+                failed=int(own["failed"].sum()),
                 planned=planned[environment, algorithm],
-                steps=min((int(m["global_step"].iloc[-1]) for m in found.values()), default=0),
-                updates=min((len(m.tail(LAST_UPDATES)) for m in found.values()), default=0),
+                steps=int(own["steps"].min()) if len(own) else 0,
+                window=_window(suite, environment, algorithm),
+                detectable=float(detectable_difference(np.sqrt(2) * spread, len(scores))),
                 paper=paper.get(algorithm, {}).get(environment),
+                zoo=f"{zoo['mean']:g} ± {zoo['deviation']:g}" if beside and zoo else "",
             )
         )
     return cells
 
 
+def _window(suite: Suite, environment: str, algorithm: str) -> int:
+    totals = [
+        run.args["total_timesteps"]
+        for run in suite.runs
+        if (run.environment, run.algorithm) == (environment, algorithm)
+    ]
+    return round(window_of(max(totals)))
+
+
 def notes(results: Results, cells: list[Cell]) -> list[str]:
     """What a reader must know before comparing."""
-    paper, run = paper_numbers("table1"), [c for c in cells if c.agents]
+    paper = paper_numbers("table1")
+    run = [cell for cell in cells if cell.agents]
     lines = [results.suite.note] if results.suite.note else []
-    if any(c.steps < paper["timesteps"] for c in run):
+    if any(cell.steps < paper["timesteps"] for cell in run):
         lines.append(
             f"Steps done: {_span(c.steps for c in run)}; the paper's runs have "
             f"{paper['timesteps']:,}. Shorter runs can neither confirm nor refute it."
         )
-    if any(c.updates < LAST_UPDATES for c in run):
-        lines.append(
-            f"Means are over all updates where a run has fewer than {LAST_UPDATES}: "
-            f"{_span(c.updates for c in run)} here."
-        )
     if run:
+        lines.append(
+            f"Training scores are over the last {_span(c.window for c in run)} steps; the paper's "
+            "are over its last 100 updates, 200,000 steps."
+        )
         lines.append(
             f"Agents in a cell: {_span(c.agents for c in run)}; "
             f"seeds: {_span(c.seeds for c in run)}. "
             f"The paper has {paper['agents']} agents for each of {paper['seeds']} seeds."
         )
-    if any(c.agents > 1 for c in cells):
-        lines.append("Brackets hold the 95% bootstrap interval of the mean over agents.")
+    if any(cell.agents > 1 for cell in run):
+        lines.append(
+            "[Brackets] hold the 95% studentized bootstrap interval of the mean over agents. "
+            "{Braces} hold the smallest and the largest score, where there are fewer than 5 "
+            "agents, or fewer than 30 with skewed scores: no interval can be trusted there."
+        )
+        lines.append(
+            "In parentheses: agents, failed ones among them, and the difference to an arm of the "
+            "same spread that would have been found with 80% power at 5%."
+        )
+    if any(cell.failed for cell in cells):
+        lines.append(
+            "A failed run's numbers became non-finite. It counts with the worst score of its task."
+        )
+    return lines + _incomplete(results, cells)
+
+
+def _incomplete(results: Results, cells: list[Cell]) -> list[str]:
+    lines = []
     missing = [f"{c.algorithm} on {c.environment}" for c in cells if not c.agents]
     partial = [
         f"{c.algorithm} on {c.environment} ({c.agents} of {c.planned})"
@@ -117,69 +187,85 @@ def _span(numbers: Iterable[int]) -> str:
 
 def to_frame(cells: list[Cell]) -> pd.DataFrame:
     """A row for each cell, for CSV."""
-    rows = [
-        {
-            **{k: v for k, v in dataclasses.asdict(c).items() if k not in ("estimate", "n")},
-            "mean": c.estimate.mean,
-            "low": c.estimate.low,
-            "high": c.estimate.high,
-        }
-        for c in cells
-    ]
+    rows = []
+    for cell in cells:
+        fields = {field.name: getattr(cell, field.name) for field in dataclasses.fields(cell)}
+        del fields["estimate"], fields["scores"]
+        mean, low, high, _ = cell.estimate
+        rows.append({**fields, "mean": mean, "low": low, "high": high})
     return pd.DataFrame(rows)
 
 
 def to_rows(suite: Suite, cells: list[Cell]) -> tuple[list[str], list[list[str]]]:
-    """The table as text: a header, and a row for each task."""
+    """The table as text: a header, and a row for each task.
+
+    Beside an algorithm's column stands the paper's, or the zoo's, if any cell has a number there.
+    """
     algorithms = [a for a in suite.algorithms if any(c.algorithm == a for c in cells)]
     found = {(c.environment, c.algorithm): c for c in cells}
+    others = [
+        (algorithm, source)
+        for algorithm in algorithms
+        for source in ("paper", "zoo")
+        if any(_published(c, source) for c in cells if c.algorithm == algorithm)
+    ]
     header = ["task"]
     for algorithm in algorithms:
-        header += [algorithm, f"{algorithm}, paper"]
+        header.append(algorithm)
+        header += [f"{algorithm}, {source}" for name, source in others if name == algorithm]
     rows = []
     for environment in suite.environments:
         row = [environment]
         for algorithm in algorithms:
             cell = found.get((environment, algorithm))
-            paper = cell.paper if cell else None
-            row += [cell.text if cell else "", "" if paper is None else f"{paper:.1f}"]
+            row.append(cell.text if cell else "")
+            row += [_published(cell, source) for name, source in others if name == algorithm]
         rows.append(row)
     return header, rows
 
 
-def to_markdown(results: Results, cells: list[Cell]) -> str:
+def _published(cell: Cell | None, source: str) -> str:
+    if cell is None:
+        return ""
+    if source == "zoo":
+        return cell.zoo
+    return "" if cell.paper is None else f"{cell.paper:.1f}"
+
+
+def to_markdown(results: Results, cells: list[Cell], outcome: str = "reward") -> str:
     """The table and its notes, then how much each cell rests on."""
     header, rows = to_rows(results.suite, cells)
-    about = ["task", "algorithm", "agents", "seeds", "steps", "updates"]
+    about = ["task", "algorithm", "agents", "failed", "seeds", "steps", "window"]
     weights = [
-        [c.environment, c.algorithm, f"{c.agents} of {c.planned}", str(c.seeds), f"{c.steps:,}",
-         str(c.updates)] for c in cells
+        [c.environment, c.algorithm, f"{c.agents} of {c.planned}", str(c.failed), str(c.seeds),
+         f"{c.steps:,}", f"{c.window:,}"] for c in cells
     ]  # fmt: skip
-    return (
-        "\n\n".join(
-            [
-                f"# {results.suite.title}",
-                f"{paper_numbers('table1')['metric'].capitalize()}.",
-                to_markdown_table(header, rows),
-                "\n".join(f"- {line}" for line in notes(results, cells)),
-                "What each cell rests on:",
-                to_markdown_table(about, weights),
-            ]
-        )
-        + "\n"
-    )
+    parts = [
+        f"# {results.suite.title}",
+        f"{OUTCOMES[outcome].capitalize()}.",
+        to_markdown_table(header, rows),
+        "\n".join(f"- {line}" for line in notes(results, cells)),
+        "What each cell rests on:",
+        to_markdown_table(about, weights),
+    ]
+    return "\n\n".join(parts) + "\n"
 
 
-def to_rich(results: Results, cells: list[Cell]) -> Table:
-    """The table for a terminal: the paper's number below ours."""
+def to_rich(results: Results, cells: list[Cell], outcome: str = "reward") -> Table:
+    """The table for a terminal: what was published below ours."""
     header, rows = to_rows(results.suite, cells)
-    table = Table(
-        title=f"{results.suite.name}: {paper_numbers('table1')['metric']}", show_lines=True
-    )
-    table.add_column(header[0])
-    for name in header[1::2]:
-        table.add_column(name, justify="right")
-    for task, *texts in rows:
-        pairs = zip(texts[::2], texts[1::2], strict=True)
-        table.add_row(task, *(f"{ours}\n[dim]paper {paper or '–'}[/]" for ours, paper in pairs))
+    title = f"{results.suite.name}: {OUTCOMES[outcome].partition(':')[0]}"
+    table = Table(title=title, show_lines=True)
+    for name in header:
+        if ", paper" not in name and ", zoo" not in name:
+            table.add_column(name, justify="left" if name == "task" else "right")
+    for row in rows:
+        texts: list[str] = []
+        for name, text in zip(header, row, strict=True):
+            algorithm, _, source = name.rpartition(", ")
+            if algorithm and source in ("paper", "zoo"):
+                texts[-1] += f"\n[dim]{source} {text or '–'}[/]"
+            else:
+                texts.append(text.replace("[", r"\["))
+        table.add_row(*texts)
     return table

@@ -1,4 +1,4 @@
-"""Aggregates over tasks of Agarwal et al. (2021): tasks are strata, agents are resampled in each."""
+"""Aggregates over tasks of Agarwal et al. (2021): agents are resampled within tasks."""
 
 from __future__ import annotations
 

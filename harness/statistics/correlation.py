@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse, stats
 
-from harness.statistics.intervals import Estimate, half_width
+from harness.statistics.intervals import Estimate
 
 PERMUTATIONS = 4096
 

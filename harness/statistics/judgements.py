@@ -1,8 +1,9 @@
 """The tests behind the claims. Every function takes leading axes: a data set, or thousands of them.
 
-A claim's tests are one family. Its headlines, which look at all tasks together, share four fifths of
-the 5%, and its single tasks the rest; by Holm's correction what is decided passes its share on. So the
-chance that a claim on which nothing is true shows any false word, wherever it stands, is at most 5%.
+A claim's tests are one family. Its headlines, which look at all tasks together, share four fifths
+of the 5%, and its single tasks the rest. By Holm's correction a test that is decided passes its
+share on. So where nothing of a claim is true, the chance of a false word anywhere in it is at most
+5%.
 """
 
 from __future__ import annotations
@@ -82,9 +83,7 @@ def compare_arms(first: np.ndarray, second: np.ndarray) -> Comparison:
         detectable=detectable_difference(_deviation(heads), headline.n, share)
     )
     share = 1 / np.maximum((~np.isnan(single.p)).sum(axis=(-2, -1)), 1)[..., None, None]
-    tasks = tasks._replace(
-        detectable=detectable_difference(_deviation(differences), counts, share)
-    )
+    tasks = tasks._replace(detectable=detectable_difference(_deviation(differences), counts, share))
 
     bound = NEGLIGIBLE * _deviation(np.where(present, first, np.nan))
     negligible = (tasks.low >= -bound) & (tasks.high <= bound) & (bound > 0)
@@ -134,9 +133,7 @@ def _weights(headlines: np.ndarray, tasks: np.ndarray) -> np.ndarray:
     """Shares of the level, `[..., headlines + tasks]`, each kind's split evenly."""
     kinds = ((headlines, HEADLINES), (tasks, 1 - HEADLINES))
     shares = [
-        np.broadcast_to(
-            share / np.maximum((~np.isnan(p)).sum(axis=-1, keepdims=True), 1), p.shape
-        )
+        np.broadcast_to(share / np.maximum((~np.isnan(p)).sum(axis=-1, keepdims=True), 1), p.shape)
         for p, share in kinds
     ]
     return np.concatenate(shares, axis=-1)

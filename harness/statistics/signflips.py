@@ -1,10 +1,10 @@
 """Sign-flip tests of paired differences, and the intervals that invert them.
 
 Under the hypothesis that the two arms are alike, each difference could as well have had the other
-sign. Flipping a set of differences lowers their sum by twice the sum of the set, so only the sums of
-subsets matter. SciPy's `permutation_test` says the same of one data set (a test compares them); here
-the subsets are the rows of one matrix, which serves thousands of data sets by a matrix product, and
-whose subset means are the ends of the interval.
+sign. Flipping a set of differences lowers their sum by twice the sum of the set, so only the sums
+of subsets matter. SciPy's `permutation_test` says the same of one data set (a test compares them).
+Here the subsets are the rows of one matrix: a product with it serves thousands of data sets, and
+the means of the subsets are the ends of the interval.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import functools
 from collections.abc import Iterator
 
 import numpy as np
-from scipy import stats
 
 from harness.statistics.families import ALPHA
 
@@ -99,17 +98,34 @@ def smallest_n(share: float = 1.0, alpha: float = ALPHA) -> int:
 
 
 def detectable_difference(
-    spread: np.ndarray, n: np.ndarray, share: np.ndarray, alpha: float = ALPHA
+    spread: np.ndarray, n: np.ndarray, share: np.ndarray | float = 1.0
 ) -> np.ndarray:
     """The mean difference that n pairs of this spread would have shown with 80% power.
 
-    spread / sqrt(n) * (t(1 - alpha * share / 2) + t(0.8)), Student's t with n - 1 degrees. NaN
-    where n is too small to reach `alpha` at all.
+    Args:
+        spread: Standard deviation of the differences.
+        n: How many there are.
+        share: The share of `ALPHA` that the test has.
+
+    Returns:
+        The difference; NaN where n is too small to reach the level at all.
     """
-    degrees = np.maximum(np.asarray(n) - 1, 1)
-    reach = stats.t.ppf(1 - alpha * share / 2, degrees) + stats.t.ppf(POWER, degrees)
-    enough = 2.0 ** (1 - np.asarray(n, dtype=np.float64)) <= alpha * share * (1 + 1e-9)
-    return np.where(enough, spread * reach / np.sqrt(np.maximum(n, 1)), np.nan)
+    return spread * np.vectorize(_detectable_unit, otypes=[float])(n, ALPHA * np.asarray(share))
+
+
+@functools.cache
+def _detectable_unit(n: int, alpha: float) -> float:
+    """The same for differences of deviation 1, normally distributed.
+
+    A shift is found where the interval's lower end, shifted with it, is above 0. So it is the 80%
+    quantile of how far below 0 that end lies without a shift. Student's formula promises too much:
+    at a level that only the smallest p reaches, all signs must agree.
+    """
+    if n < 2 or 2.0 ** (1 - n) > alpha * (1 + 1e-9):
+        return np.nan
+    drawn = np.random.default_rng(n).normal(size=(2000, n))
+    low, _ = sign_flip_interval(drawn, alpha)
+    return float(np.quantile(-low, POWER))
 
 
 def _rows(differences: np.ndarray) -> tuple[np.ndarray, tuple[int, ...]]:

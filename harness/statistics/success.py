@@ -1,8 +1,8 @@
 """Success rates over levels: of one training run, of several, and of two kinds of them.
 
-Rates vary over training runs, over levels (the same ones for every run) and over repeats. For n runs
-on L levels, with the variance of the runs' means s_r^2, that of the levels' means s_l^2, and that of
-what is left s_e^2, which holds the repeats' noise:
+Rates vary over training runs, over levels (the same ones for every run) and over repeats. For n
+runs on L levels let s_r^2 be the variance of the runs' means, s_l^2 that of the levels' means, and
+s_e^2 that of what is left, which holds the repeats' noise:
 
     Var(mean) = s_r^2 / n + s_l^2 / L - s_e^2 / (n L)
 

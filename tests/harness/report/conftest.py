@@ -12,7 +12,6 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
-from harness.report.claims import MIN_UPDATES
 from harness.report.results import Results, load_results
 from harness.store import Store
 from harness.suite import load_suite
@@ -37,6 +36,7 @@ num_steps = 100
 num_minibatches = 2
 """
 Curve = float | Sequence[float] | None
+UPDATES = 40  # of a synthetic run
 
 
 def make_study(
@@ -47,7 +47,7 @@ def make_study(
     algorithms: Sequence[str] = ("PPO", "PPO reg"),
     tasks: Sequence[str] = ("Hopper",),
     agents: int = 10,
-    updates: int = MIN_UPDATES,
+    updates: int = UPDATES,
     unfinished: Callable[[str, str, int], bool] = lambda *_: False,
     more: str = "",
 ) -> Results:

@@ -1,0 +1,75 @@
+"""A row for each agent, and the scores of those that failed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from harness.report.results import Results
+from harness.statistics import early_psi, final_score, moved_together, training_psi, training_score
+from harness.suite import RunSpec
+
+COLUMNS = {
+    "environment": str, "algorithm": str, "plain": bool, "seed": int, "agent": int, "done": bool,
+    "failed": bool, "updates": int, "steps": int, "reward": float, "final": float,
+    "final_sampled": float, "psi": float, "early_psi": float, "together": float,
+}  # fmt: skip
+
+
+def agent_table(results: Results) -> pd.DataFrame:
+    """A row for each agent that has begun.
+
+    `reward` is the training score, `final` and `final_sampled` the final policy's mean return,
+    `psi` and `early_psi` are means over the score's window and over the first tenth of the steps,
+    `together` is the correlation of their changes, `failed` is whether its own numbers became
+    non-finite. Such an agent counts as done, and has no score of its own: see `fill_failed`.
+    """
+    rows = [
+        _row(run, results)
+        for run in results.suite.runs
+        if run.run_id in results.metrics or run.run_id in results.diverged
+    ]
+    return pd.DataFrame(rows, columns=list(COLUMNS)).astype(COLUMNS)
+
+
+def _row(run: RunSpec, results: Results) -> dict[str, Any]:
+    metrics = results.metrics.get(run.run_id)
+    if metrics is None:
+        columns = ["global_step", "charts/episodic_return", "conditioning/psi"]
+        metrics = pd.DataFrame(columns=columns, dtype=float)
+    failed = run.run_id in results.diverged
+    total = run.args["total_timesteps"]
+    episodes = results.evaluations.get(run.run_id)
+    played = episodes is not None and not failed and "episode" in episodes
+
+    return {
+        "environment": run.environment,
+        "algorithm": run.algorithm,
+        "plain": run.args.get("coefficient") == 0 and not run.args.get("perturb_obs"),
+        "seed": run.args["seed"],
+        "agent": run.args["agent"],
+        "done": failed or run.run_id in results.done,
+        "failed": failed,
+        "updates": len(metrics),
+        "steps": int(metrics["global_step"].max()) if len(metrics) else 0,
+        "reward": np.nan if failed else training_score(metrics, total),
+        "final": final_score(episodes) if played else np.nan,
+        "final_sampled": final_score(episodes, "sampled") if played else np.nan,
+        "psi": training_psi(metrics, total),
+        "early_psi": early_psi(metrics, total),
+        "together": moved_together(metrics),
+    }
+
+
+def fill_failed(agents: pd.DataFrame, column: str) -> pd.DataFrame:
+    """The agents, those that failed with the worst score of their task among all that are given.
+
+    Hand it the compared arms only. Where every run of a task failed they are all equal: 0.
+    """
+    if not agents["failed"].any():
+        return agents
+    worst = agents.groupby("environment")[column].transform("min").fillna(0.0)
+    scores = agents[column].where(~agents["failed"], worst)
+    return agents.assign(**{column: scores})
