@@ -1,0 +1,91 @@
+"""Intervals of a mean: by hand, and how often they hold the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from harness.statistics import estimate_mean, half_width, interval_of_means, is_skewed
+
+
+def test_the_interval_is_that_of_the_normal_distribution_for_many_values():
+    values = np.random.default_rng(1).normal(5.0, 2.0, size=400)
+    mean, low, high, n = estimate_mean(values)
+    error = 1.96 * values.std() / np.sqrt(400)
+    assert mean == pytest.approx(values.mean())
+    assert (low, high) == pytest.approx((mean - error, mean + error), abs=0.03)
+    assert n == 400
+
+
+@pytest.mark.parametrize("n", [10, 30])
+def test_intervals_cover_the_truth_nineteen_times_in_twenty(n):
+    rng = np.random.default_rng(2)
+    found = [estimate_mean(rng.normal(size=n), skewed=False) for _ in range(300)]
+    covered = sum(low <= 0 <= high for _, low, high, _ in found)
+    assert 277 <= covered <= 296  # 95% of 300, two standard errors down and three up
+
+
+def test_skewed_values_have_an_interval_that_leans():
+    """The long tail is on the right, so the mean may lie further to the right."""
+    values = np.random.default_rng(3).exponential(size=60)
+    mean, low, high, _ = estimate_mean(values)
+    assert high - mean > 1.2 * (mean - low)
+
+
+def test_equal_values_have_no_spread():
+    assert estimate_mean(np.full(5, 3.0)) == (3.0, 3.0, 3.0, 5)
+
+
+@pytest.mark.parametrize(
+    ("values", "mean"), [([], np.nan), ([4.0], 4.0), ([1.0, 2.0, 6.0, 7.0], 4.0)]
+)
+def test_fewer_than_five_values_have_no_interval(values, mean):
+    estimate = estimate_mean(np.array(values))
+    np.testing.assert_equal(estimate, (mean, np.nan, np.nan, len(values)))
+
+
+def test_few_skewed_values_have_no_interval():
+    one_success = np.array([0.0, 0.1, 0.2] * 3 + [50.0])
+    assert np.isnan(estimate_mean(one_success).low)
+    assert not np.isnan(estimate_mean(one_success, skewed=False).low)
+    assert not np.isnan(estimate_mean(np.tile(one_success, 3)).low)  # 30 agents
+
+
+def test_values_that_look_even_have_none_where_their_task_is_skewed():
+    assert np.isnan(estimate_mean(np.arange(10.0), skewed=True).low)
+
+
+def test_arms_are_judged_together():
+    """No success among ten, but some in the other arms: this one may have missed them by chance."""
+    without = np.linspace(-1, 1, 10)
+    with_one = np.append(without[:-1], 30.0)
+    assert not is_skewed([without])
+    assert is_skewed([without, with_one])
+    assert not is_skewed([without, without + 1000.0])  # arms differ, agents do not
+    assert not is_skewed([np.full(5, 2.0), np.empty(0)])
+
+
+def test_the_same_values_give_the_same_interval():
+    values = np.random.default_rng(4).normal(size=12)
+    assert estimate_mean(values) == estimate_mean(values)
+
+
+def test_intervals_of_rows_are_students():
+    values = np.random.default_rng(5).normal(size=(3, 8)) + np.arange(3)[:, None]
+    low, high = interval_of_means(values)
+    for row, *ends in zip(values, low, high, strict=True):
+        expected = stats.t.interval(0.95, 7, row.mean(), stats.sem(row))
+        assert ends == pytest.approx(expected)
+
+
+def test_missing_entries_of_a_row_do_not_count():
+    row = [1.0, np.nan, 3.0, 5.0]
+    low, high = interval_of_means(np.array([row, [np.nan] * 4, [1.0, np.nan, np.nan, np.nan]]))
+    expected = stats.t.interval(0.95, 2, 3.0, 2 / np.sqrt(3))
+    assert (low[0], high[0]) == pytest.approx(expected)
+    assert np.isnan([low[1], high[1], low[2], high[2]]).all()
+
+
+def test_half_a_width_by_hand():
+    assert half_width(2.0, 4) == pytest.approx(3.182 * 2.0 / 2, abs=1e-3)

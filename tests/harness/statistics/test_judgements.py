@@ -1,0 +1,166 @@
+"""The tests of the claims, on data with a known answer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from harness.statistics import holm, sign_flip_test
+from harness.statistics.judgements import associate, compare_arms
+
+RNG = np.random.default_rng(0)
+PAIRS = RNG.normal(size=(2, 2, 3, 10))  # arms, contrasts, tasks, n
+
+
+def test_the_headline_is_the_mean_over_tasks_in_deviations_of_both_arms():
+    first, second = PAIRS * np.array([1.0, 100.0, 0.01])[:, None]
+    found = compare_arms(first, second)
+    for contrast in range(2):
+        parts = [
+            (second[contrast, t] - first[contrast, t]).mean()
+            / np.concatenate([first[contrast, t], second[contrast, t]]).std(ddof=1)
+            for t in range(3)
+        ]
+        assert found.headline.mean[contrast] == pytest.approx(np.mean(parts))
+    assert found.headline.n.tolist() == [10, 10]
+
+
+def test_signs_are_flipped_jointly_over_tasks():
+    """Three tasks that repeat each other are no more evidence than one."""
+    first = np.repeat(PAIRS[0, :1, :1], 3, axis=1)
+    second = np.repeat(PAIRS[1, :1, :1], 3, axis=1)
+    found = compare_arms(first, second)
+    assert found.headline.p[0] == sign_flip_test(second[0, 0] - first[0, 0])
+    np.testing.assert_allclose(found.tasks.p[0], found.headline.p[0])
+
+
+def test_the_family_is_the_headlines_and_all_tasks():
+    first, second = PAIRS
+    found = compare_arms(first, second + 0.8)
+    tests = np.concatenate([found.headline.p, found.tasks.p.ravel()])
+    expected = holm(tests, np.array([0.4, 0.4] + [0.2 / 6] * 6))
+    np.testing.assert_allclose(found.headline.corrected, expected[:2])
+    np.testing.assert_allclose(found.tasks.corrected.ravel(), expected[2:])
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_words_are_the_direction_of_what_is_found(sign):
+    first, second = PAIRS
+    found = compare_arms(first, first + sign * (1 + 0.01 * second))
+    assert (found.headline.word == sign).all()
+    assert (found.tasks.word == sign).all()
+    even = compare_arms(first, first + 0.001 * second)
+    assert not even.headline.word.any()
+    assert not even.tasks.word.any()
+
+
+def test_a_loss_on_one_task_is_seen_where_headlines_say_nothing():
+    """30 pairs: the other tasks gain what this one loses."""
+    rng = np.random.default_rng(1)
+    first = rng.normal(size=(1, 3, 30))
+    second = rng.normal(size=(1, 3, 30)) + np.array([-2.0, 1.0, 1.0])[:, None]
+    found = compare_arms(first, second)
+    assert found.headline.word.tolist() == [0]
+    assert found.tasks.word[0, 0] == -1
+
+
+def test_exchanging_the_arms_turns_everything_round():
+    first, second = PAIRS
+    there = compare_arms(first, second + 0.5)
+    back = compare_arms(second + 0.5, first)
+    np.testing.assert_allclose(back.headline.mean, -there.headline.mean)
+    np.testing.assert_allclose(back.headline.p, there.headline.p)
+    np.testing.assert_allclose(back.tasks.corrected, there.tasks.corrected)
+    np.testing.assert_allclose(back.tasks.low, -there.tasks.high)
+
+
+def test_negligible_is_the_whole_interval_within_half_a_deviation():
+    first = np.repeat(np.linspace(-1, 1, 10)[None, None], 3, axis=1)  # deviation 0.66, half 0.33
+    wobble = 0.01 * RNG.normal(size=10)
+    gains = np.array([0.25, 0.4, -0.25])
+    found = compare_arms(first, first + gains[:, None] + wobble)
+    assert found.negligible[0].tolist() == [True, False, True]
+    assert (found.tasks.word[0] == [1, 1, -1]).all()  # sure, and small all the same
+
+
+def test_the_bound_of_negligible_is_the_plain_arms():
+    wide = np.linspace(-10, 10, 10)
+    narrow = np.linspace(-1, 1, 10)
+    assert compare_arms(wide[None, None], (wide + narrow)[None, None]).negligible.all()
+    assert not compare_arms(narrow[None, None], (wide + narrow)[None, None]).negligible.any()
+
+
+def test_equal_arms_are_no_difference():
+    first = np.full((1, 2, 8), 5.0)
+    found = compare_arms(first, first)
+    assert found.headline.p.tolist() == [1.0]
+    assert (found.tasks.mean == 0).all()
+    assert not found.headline.word.any()
+
+
+def test_missing_agents_leave_the_means_of_their_tasks():
+    first = PAIRS[0].copy()
+    second = PAIRS[1] + 0.5
+    first[0, 1, :4] = np.nan
+    second[1, 2] = np.nan
+    found = compare_arms(first, second)
+    assert found.tasks.n.tolist() == [[10, 6, 10], [10, 10, 0]]
+    alone = compare_arms(first[:1, 1:2, 4:], second[:1, 1:2, 4:])
+    assert found.tasks.mean[0, 1] == pytest.approx(alone.tasks.mean[0, 0])
+    assert found.tasks.p[0, 1] == pytest.approx(alone.tasks.p[0, 0])
+    means = [[np.mean(d[~np.isnan(d)]) for d in tasks] for tasks in found.standard[:, :2]]
+    third = found.standard[0, 2].mean()
+    assert found.headline.mean[0] == pytest.approx(np.mean([*means[0], third]))
+    assert found.headline.mean[1] == pytest.approx(np.mean(means[1]))
+    assert np.isnan(found.tasks.p[1, 2])
+
+
+def test_data_sets_do_not_mix():
+    many = np.random.default_rng(3).normal(size=(2, 5, 2, 3, 8))
+    found = compare_arms(many[0], many[1])
+    one = compare_arms(many[0, 3], many[1, 3])
+    for several, single in zip(found.headline, one.headline, strict=True):
+        np.testing.assert_allclose(several[3], single)
+    for several, single in zip(found.tasks, one.tasks, strict=True):
+        np.testing.assert_allclose(several[3], single)
+
+
+@pytest.mark.parametrize(("sign", "word"), [(-1.0, 1), (1.0, -1)])
+def test_psi_that_falls_with_the_score_is_what_claim_a_says(sign, word):
+    rng = np.random.default_rng(4)
+    score = rng.normal(size=(4, 10))
+    psi = sign * score + 0.1 * rng.normal(size=(2, 4, 10))
+    found = associate(psi, score, np.array([0, 0, 1, 1]))
+    assert (found.headline.word == word).all()
+    assert (found.tasks.word == word).all()
+    assert (np.sign(found.headline.mean) == sign).all()
+    assert found.tasks.mean.shape == (2, 2)
+
+
+def test_parts_and_tasks_are_not_mixed_up():
+    """Late psi falls with the score on task 1 only; early psi has nothing to do with it."""
+    rng = np.random.default_rng(5)
+    score = rng.normal(size=(2, 12))
+    psi = rng.normal(size=(2, 2, 12))
+    psi[0, 1] = -score[1]
+    found = associate(psi, score, np.array([0, 1]))
+    assert found.tasks.mean[0, 1] == pytest.approx(-1.0)
+    assert found.tasks.word.tolist() == [[0, 1], [0, 0]]
+    assert found.headline.mean[0] == pytest.approx(found.tasks.mean[0].mean())
+
+
+def test_the_test_is_one_sided_but_for_a_fifth():
+    score = np.arange(4.0)[None]
+    falling = associate(np.stack([-score, -score]), score, np.array([0]))
+    rising = associate(np.stack([score, score]), score, np.array([0]))
+    assert falling.headline.p == pytest.approx([1 / 24 / 0.8] * 2)
+    assert rising.headline.p == pytest.approx([1 / 24 / 0.2] * 2)
+
+
+def test_what_could_have_been_found_is_a_correlation():
+    rng = np.random.default_rng(6)
+    few = associate(rng.normal(size=(2, 1, 10)), rng.normal(size=(1, 10)), np.array([0]))
+    many = associate(rng.normal(size=(2, 4, 30)), rng.normal(size=(4, 30)), np.array([0, 0, 1, 1]))
+    # deviation 1 / sqrt(9), z(1 - 0.05 * 0.8 / 2) + z(0.8) = 2.05 + 0.84
+    assert few.headline.detectable == pytest.approx([2.9 / 3] * 2, rel=0.05)
+    assert (many.headline.detectable < 0.35).all()
