@@ -11,7 +11,7 @@ import pytest
 
 from baselines import ppo_reg_coinrun
 from harness.evaluation.control import COLUMNS
-from harness.store import Store
+from harness.store import Store, write_json
 from harness.suite import RunSpec, Suite, load_suite
 
 TINY = """
@@ -68,6 +68,7 @@ def write_run(
     columns: dict[str, Sequence[float]] | None = None,
     episodes: pd.DataFrame | None = None,
     done: bool = True,
+    diverged: bool = False,
 ) -> None:
     """What a run leaves behind, with these mean returns and psi of its updates.
 
@@ -80,6 +81,7 @@ def write_run(
         episodes: What its evaluation found, if it has one: see `make_episodes`. By default that of
             a control agent is two episodes of each policy, whose returns are the last of `returns`.
         done: Whether it came to its end.
+        diverged: Whether its numbers became non-finite, which is an end too.
     """
     store.start(spec, ["true"], [spec])
     steps = np.arange(1, len(returns) + 1) * 100
@@ -98,6 +100,9 @@ def write_run(
         episodes = make_control_episodes([returns[-1]] * 2, [returns[-1]] * 2)
     if episodes is not None:
         episodes.to_csv(store.path(spec, "evaluation.csv"), index=False)
+    if diverged:
+        failure = {"update": len(returns), "what": "loss", "message": "loss is NaN"}
+        write_json(store.path(spec, "diverged.json"), failure)
     if done:
         store.finish(spec, returncode=0, seconds=1.0)
 

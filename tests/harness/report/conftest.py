@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from harness.report.results import Results, load_results
 from harness.store import Store
 from harness.suite import load_suite
-from tests.harness.conftest import write_run
+from tests.harness.conftest import make_control_episodes, write_run
 
 ARGS = {
     "PPO": 'baseline = "ppo_reg"\nargs = { coefficient = 0.0 }',
@@ -31,7 +31,7 @@ seeds = [1, 2]
 agents = {agents}
 
 [args]
-total_timesteps = 200
+total_timesteps = 4000
 num_steps = 100
 num_minibatches = 2
 """
@@ -49,12 +49,16 @@ def make_study(
     agents: int = 10,
     updates: int = UPDATES,
     unfinished: Callable[[str, str, int], bool] = lambda *_: False,
+    diverged: Callable[[str, str, int], bool] = lambda *_: False,
+    final: Callable[[str, str, int], float | None] = lambda *_: None,
     more: str = "",
 ) -> Results:
     """Make results out of a function for the reward and one for psi.
 
     Each is called with task, algorithm and the number of the agent among all of both seeds, and
-    gives a curve, or one value for all updates, or None where there is no such run.
+    gives a curve, or one value for all updates, or None where there is no such run. An update is
+    100 of 4000 steps, so training scores are over the last 4 of 40. `final` gives the return of
+    the final policy.
     """
     text = COMMON.format(agents=agents // 2) + more
     text += "".join(f'\n[[algorithms]]\nname = "{a}"\n{ARGS[a]}\n' for a in algorithms)
@@ -67,7 +71,12 @@ def make_study(
         key = (run.environment, run.algorithm, number)
         if (curve := reward(*key)) is not None:
             returns = np.broadcast_to(curve, updates)
-            write_run(store, run, returns, psi(*key), done=not unfinished(*key))
+            last = final(*key)
+            played = None if last is None else make_control_episodes([last], [last - 1])
+            write_run(
+                store, run, returns, psi(*key), episodes=played, done=not unfinished(*key),
+                diverged=diverged(*key),
+            )  # fmt: skip
     return load_results(suite, store)
 
 

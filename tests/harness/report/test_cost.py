@@ -5,20 +5,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.report.claims import MIN_UPDATES
-from harness.report.cost import cost_claim
+from harness.report.cost import added_time, cost_claim
 from harness.report.results import load_results
+from harness.store import read_json, write_json
 from harness.suite import load_suite
 from tests.harness.conftest import write_run
 
 
-def claim_of(store, speed, seeds=2, updates=MIN_UPDATES, agents=2):
+def claim_of(store, speed, seeds=2, agents=2, said=lambda run: {}):
     """Plain runs take 1000 steps/s, regularized ones what `speed` says for task and agent."""
     suite = load_suite("table1", seeds=seeds, agents=agents)
     for run in suite.runs:
         reg = run.algorithm.endswith(" reg")
         sps = speed(run.environment, run.args["agent"]) if reg else 1000.0
-        write_run(store, run, np.zeros(updates), columns={"charts/SPS": [sps] * updates})
+        write_run(store, run, [0.0], columns={"charts/SPS": [sps]})
+        path = store.path(run, "spec.json")
+        write_json(path, {**(read_json(path) or {}), **said(run)})
     return cost_claim(load_results(suite, store))
 
 
@@ -35,14 +37,15 @@ def test_time_added_by_hand(store, speed, added, expected):
     assert (claim.letter, claim.verdict) == ("e", expected)
     assert [f.task for f in claim.findings] == ["PPO", "TRPO"]
     for finding in claim.findings:
+        assert finding.about == "reg / plain - 1: time for a step, control, unknown"
         assert finding.estimate.mean == pytest.approx(added)
         assert finding.estimate.n == 8 * 2  # tasks and seeds, not agents
         assert finding.verdict == expected
 
 
-def test_an_interval_that_holds_the_limit_supports_nothing(store):
+def test_an_interval_that_holds_the_limit_is_undecided(store):
     claim = claim_of(store, lambda task, _: 1000 / (1.0 if task < "Hopper" else 1.2))
-    assert claim.verdict == "not supported"
+    assert claim.verdict == "undecided"
 
 
 def test_agents_of_a_seed_count_once(store):
@@ -51,11 +54,44 @@ def test_agents_of_a_seed_count_once(store):
     assert claim.findings[0].estimate.n == 16
 
 
-@pytest.mark.parametrize("few", [{"seeds": 1}, {"updates": MIN_UPDATES - 1}])
-def test_few_or_short_runs_have_no_verdict(store, few):
-    assert claim_of(store, lambda *_: 1000.0, **few).verdict == "too few runs to tell"
+def test_each_implementation_is_judged_by_itself(store):
+    """The population adds a fifth, the single file nothing."""
+
+    def said(run):
+        population = run.environment in ("Humanoid", "Ant", "Hopper", "Reacher")
+        return {"implementation": "population" if population else "single file", "machine": "x"}
+
+    slow = ("Humanoid", "Ant", "Hopper", "Reacher")
+    claim = claim_of(store, lambda task, _: 1000 / (1.2 if task in slow else 1.0), said=said)
+    found = {(f.task, f.about.rpartition(", ")[2]): f for f in claim.findings}
+    assert found["PPO", "population"].estimate.mean == pytest.approx(0.2)
+    assert found["PPO", "population"].verdict == "contradicted"
+    assert found["PPO", "single file"].verdict == "supported"
+    assert found["PPO", "single file"].estimate.n == 8
+    assert claim.verdict == "undecided"
+
+
+@pytest.mark.parametrize("what", ["implementation", "machine"])
+def test_arms_of_different_making_are_no_pair(store, what):
+    claim = claim_of(store, lambda *_: 1000.0, said=lambda run: {what: "reg" in run.algorithm})
+    assert claim.findings == []
+
+
+def test_the_whole_interval_must_be_on_one_side():
+    """Of six the interval is the range."""
+    below = added_time("x", "PPO", np.array([0.01, 0.02, 0.03, 0.05, 0.08, 0.1]))
+    assert (below.estimate.low, below.estimate.high, below.verdict) == (0.01, 0.1, "supported")
+    assert added_time("x", "PPO", np.array([0.0] * 5 + [0.11])).verdict == "undecided"
+    assert added_time("x", "PPO", np.array([0.11] * 5 + [0.12])).verdict == "contradicted"
+
+
+def test_five_pairs_decide_nothing():
+    few = added_time("x", "PPO", np.zeros(5))
+    assert (few.verdict, few.note) == ("undecided", "6 pairs could decide")
+    assert np.isnan(few.estimate.low)
 
 
 def test_without_pairs_there_is_no_finding(store):
     suite = load_suite("figure1")
-    assert cost_claim(load_results(suite, store)).findings == []
+    claim = cost_claim(load_results(suite, store))
+    assert (claim.findings, claim.verdict) == ([], "undecided")

@@ -12,17 +12,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from harness.report.claims import MIN_UPDATES, Claim, to_frame
+from harness.report.claims import Claim, to_frame
 from harness.report.page import write_report
 from harness.report.results import Results, load_results
 from harness.report.table1 import Cell, make_cells
 from harness.suite import load_suite
 from tests.harness.conftest import make_episodes, write_run
-from tests.harness.report.conftest import make_games, make_study
+from tests.harness.report.conftest import UPDATES, make_games, make_study
 
 VOID = {"meta", "img", "br", "hr", "link"}
 OPTIONAL = {"html"}  # end tags that HTML does not ask for
-RISING = np.linspace(0.0, 1.0, MIN_UPDATES)
+RISING = np.linspace(0.0, 1.0, UPDATES)
 MORE = """
 [figures]
 "Figure 2: PPO and PPO reg" = ["PPO", "PPO reg"]
@@ -95,7 +95,7 @@ def report(store):
 
 
 class Written(NamedTuple):
-    """A report of 40 agents: claim (a) is supported, (b) not, since half gain and half lose."""
+    """A report of 40 agents: claim (a) is supported; of (b) half gain a little and half lose."""
 
     results: Results
     folder: Path
@@ -150,7 +150,7 @@ def test_few_runs_make_a_page_without_a_verdict(store, suite, report, runs):
     for spec in suite.runs[:runs]:
         write_run(store, spec, [1.0, 2.0])
     folder, _, page = report(load_results(suite, store))
-    assert {text for _, text in page.verdicts} == {"too few runs to tell"}
+    assert {text for _, text in page.verdicts} <= {"undecided"}
     assert {"report.html", "table1.md", "table1.csv", "claims.csv"} <= {
         path.name for path in folder.iterdir()
     }
@@ -161,9 +161,13 @@ def test_few_runs_make_a_page_without_a_verdict(store, suite, report, runs):
 def test_the_page_says_the_verdicts(written):
     claims, page = written.claims, written.page
     found = {claim.letter: claim.verdict for claim in claims}
-    assert found == {"a": "supported", "b": "not supported", "e": "too few runs to tell"}
+    assert found == {"a": "supported", "b": "no effect", "e": "undecided"}
     rows = {cells[0]: cells[1].strip() for cells in page.cells if cells[0].startswith("(")}
-    assert rows == {f"({c.letter}) {c.statement}": c.verdict for c in claims}
+    assert set(rows) == {f"({c.letter}) {c.statement}" for c in claims}
+    for claim in claims:
+        row = rows[f"({claim.letter}) {claim.statement}"]
+        assert row.startswith(f"{claim.verdict} {claim.basis}")
+        assert all(note in row for note in claim.notes)
 
 
 def test_only_what_is_supported_looks_so(written):
@@ -171,18 +175,24 @@ def test_only_what_is_supported_looks_so(written):
     page = written.page
     coloured = {text: set(name.split()) & {"supported", "contradicted"}
                 for name, text in page.verdicts}  # fmt: skip
-    plain = {"not supported": set(), "too few runs to tell": set()}
+    plain = {"no effect": set(), "undecided": set()}
     assert coloured == {"supported": {"supported"}, **plain}
 
 
 def test_the_page_has_every_number_behind_the_verdicts(written):
     claims, page = written.claims, written.page
-    rows = [cells for cells in page.cells if len(cells) == 6]
+    rows = [cells for cells in page.cells if len(cells) == 10]
     findings = [f for claim in claims for f in claim.findings]
     shown = [row for row in rows if row[0] != "about"]
     assert [(row[0], row[1], row[4], row[5]) for row in shown] == [
-        (f.about, f.task, str(f.estimate.n), f.verdict) for f in findings
+        (f.about, f.task, str(f.estimate.n), str(f.failed)) for f in findings
     ]
+    assert [row[9].partition(" (")[0] for row in shown] == [f.verdict for f in findings]
+    for column, name in ((6, "detectable"), (7, "p"), (8, "p_holm")):
+        told = [getattr(f, name) for f in findings]
+        assert [row[column] for row in shown] == [
+            "–" if np.isnan(number) else f"{number:.2g}" for number in told
+        ]
     assert [float(row[2]) for row in shown] == pytest.approx(
         [f.estimate.mean for f in findings], rel=0.01, abs=1e-12
     )
@@ -195,13 +205,37 @@ def test_the_papers_numbers_stand_beside_ours(written):
     rows = {cells[0]: cells for cells in page.cells if len(cells) == 5}
     assert rows["Hopper"][2::2] == ["106.8", "18.6"]
     assert rows["Ant"][2::2] == ["414.1", "294.8"]
-    assert rows["Hopper"][1].startswith("5.3 [")  # agents 0 to 9, and 149.5 / 199 of learning
+    assert rows["Hopper"][1].startswith("5.5 [")  # agents 0 to 9, and what they learn
 
 
 def test_the_notes_of_the_table_are_on_the_page(written):
     page = written.page
     assert "The paper has 10 agents for each of 3 seeds." in page.text
     assert "Shorter runs can neither confirm nor refute it." in page.text
+
+
+def test_final_policies_have_a_table_of_their_own(study, tmp_path):
+    results = study(lambda *_: 1.0, final=lambda _, name, agent: len(name) + agent)
+    sections, _ = write_report(results, tmp_path)
+    page = Page((tmp_path / "report.html").read_text())
+    assert [s.title for s in sections] == [
+        "Table 1: training scores, beside the paper's", "Table 1: final policies",
+    ]  # fmt: skip
+    assert "Table 1: final policies" in page.headings
+    rows = [cells for cells in page.cells if cells[0] == "Hopper" and len(cells) == 3]
+    assert rows[0][1].startswith("7.5 [")  # 3 + 0 to 9
+    assert pd.read_csv(tmp_path / "table1_final.csv")["mean"].tolist() == [7.5, 11.5]
+
+
+def test_failed_runs_are_on_the_page_with_the_verdict_without_them(study, tmp_path):
+    results = study(
+        lambda _, name, agent: 5.0 * agent + (50.0 + agent) * (name == "PPO reg"),
+        diverged=lambda _, name, agent: name == "PPO reg" and agent == 0,
+    )
+    write_report(results, tmp_path)
+    page = Page((tmp_path / "report.html").read_text())
+    assert "1 failed; without them: supported." in page.text
+    assert "; without failed: win" in page.text
 
 
 HOSTILE = "<script>alert('1')</script>"
@@ -253,7 +287,8 @@ def test_names_of_a_suite_are_text_and_never_html(tmp_path, store, report):
 
 
 def test_claims_as_csv_are_the_findings(written):
-    saved = pd.read_csv(written.folder / "claims.csv")
+    words = {"without_failed": str, "note": str}
+    saved = pd.read_csv(written.folder / "claims.csv", dtype=words).fillna(dict.fromkeys(words, ""))
     expected = to_frame(written.claims)
     pd.testing.assert_frame_equal(saved, expected, check_dtype=False, rtol=1e-12)
     assert len(saved) == sum(len(claim.findings) for claim in written.claims)
@@ -305,8 +340,8 @@ def test_a_page_of_games_has_table_2_and_nothing_of_table_1(games, report):
     }  # fmt: skip
     rows = {cells[0]: cells for cells in page.cells if len(cells) == 7}
     assert rows["agent"][1:4] == ["seen", "seen, paper", "unseen"]
-    assert rows["PPO reg"][:3] == ["PPO reg", "50.0 [0.0, 100.0]", "60.7"]
-    assert rows["PPO"][6] == "0.0 [0.0, 0.0]"
+    assert rows["PPO reg"][:3] == ["PPO reg", "50.0 [0.0, 100.0] (n 1, 0 failed, finds –)", "60.7"]
+    assert rows["PPO"][6] == "0.0 [0.0, 0.0] (n 1, 0 failed, finds –)"
     assert "The agent's velocity is painted into the frame" in page.text
     assert len(pd.read_csv(folder / "table2.csv")) == 2 * 4
     assert pd.read_csv(folder / "claims.csv")["claim"].tolist() == ["d", "d", "e"]
@@ -334,9 +369,9 @@ def test_a_page_of_both_has_both(games, report, store, suite):
     )  # fmt: skip
     folder, claims, page = report(merged)
     assert [h[:7] for h in page.headings if h.startswith("Table")] == ["Table 1", "Table 2"]
-    assert [claim.letter for claim in claims] == ["a", "d", "e"]
+    assert [claim.letter for claim in claims] == ["d", "e"]
     task = next(cells for cells in page.cells if cells[0] == "Hopper")
-    assert task[1] == "1.5"
+    assert task[1] == "2.0 (n 1, 0 failed, finds –)"
     assert "CoinRun" not in [cells[0] for cells in page.cells]  # no row of Table 1
     assert (folder / "table1.csv").exists()
     assert (folder / "table2.csv").exists()
@@ -344,7 +379,7 @@ def test_a_page_of_both_has_both(games, report, store, suite):
 
 def test_a_page_of_games_before_anything_ran(report, store):
     _, claims, page = report(load_results(load_suite("table2"), store))
-    assert [claim.verdict for claim in claims] == ["too few runs to tell"]
+    assert [claim.verdict for claim in claims] == ["undecided"]
     assert [image["src"] for image in page.images] == ["claim_d.png"]
     assert "Not all evaluated yet: PPO, " in page.text
 
@@ -367,13 +402,13 @@ def test_the_verdict_of_claim_d_is_on_the_page(games, report):
             seen_sampled=won, unseen_sampled=won, seen_greedy=[[1]], unseen_greedy=[[1]]
         )
 
-    _, _, page = report(games(episodes=better, updates=MIN_UPDATES, seeds=seeds))
+    _, _, page = report(games(episodes=better, updates=UPDATES, seeds=seeds))
     assert [text for _, text in page.verdicts] == ["supported", "supported"]
-    rows = [cells for cells in page.cells if len(cells) == 6 and cells[0] != "about"]
+    rows = [cells for cells in page.cells if len(cells) == 10 and cells[0] != "about"]
     assert [(row[0], row[2], row[3], row[4]) for row in rows] == [
         ("reg - plain: success, seen levels", "0.5", "0.5 to 0.5", "10"),
         ("reg - plain: success, unseen levels", "0.5", "0.5 to 0.5", "10"),
-        ("reg / plain - 1: time for a step, CoinRun", "0", "0 to 0", "10"),
+        ("reg / plain - 1: time for a step, CoinRun, unknown", "0", "0 to 0", "10"),
     ]
 
 
@@ -406,7 +441,7 @@ def test_names_of_games_and_their_agents_are_text_and_never_html(games, report):
     assert all(set(image) == {"src", "alt"} for image in page.images)
     rows = [cells[0] for cells in page.cells if len(cells) == 7]
     assert rows[1:3] == [f"<em>Coin: {agent}" for agent in agents]
-    assert "<em>Coin: <script>x</script>" in [cells[1] for cells in page.cells if len(cells) == 6]
+    assert "<em>Coin: <script>x</script>" in [cells[1] for cells in page.cells if len(cells) == 10]
     assert "<script>x</script>: seen, unseen" in page.text
     for image in page.images:
         assert (folder / unquote(image["src"])).exists()

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from harness.report.paper import paper_numbers
 from harness.report.results import load_results
 from harness.report.table1 import (
     make_cells,
@@ -14,7 +13,9 @@ from harness.report.table1 import (
     to_frame,
     to_markdown,
     to_rich,
+    to_rows,
 )
+from harness.statistics import detectable_difference, estimate_mean
 from harness.suite import load_suite
 from tests.harness.conftest import write_run
 
@@ -29,25 +30,58 @@ def cells(store, suite):
     """PPO on Hopper is complete; PPO reg on Hopper has one agent; nothing ran on Reacher."""
     for spec in suite.runs:
         if spec.environment == "Hopper" and spec.algorithm == "PPO":
-            write_run(store, spec, [0.0, 10.0 * spec.args["seed"]])
+            write_run(store, spec, [0.0, 10.0 * spec.args["seed"] + spec.args["agent"]])
         if spec.run_id == "ppo-reg__Hopper__s1__a0":
-            write_run(store, spec, [7.0, np.nan, 9.0])
+            write_run(store, spec, [7.0, np.nan, 8.0])
     return make_cells(load_results(suite, store))
 
 
-def test_a_cell_is_the_mean_over_agents_of_their_final_score(cells):
+def test_a_cell_is_the_mean_over_agents_of_their_training_score(cells):
     cell = cells[0]
     assert (cell.algorithm, cell.environment) == ("PPO", "Hopper")
-    # two agents of seed 1 score 5, two of seed 2 score 10
-    assert cell.estimate.mean == 7.5
-    assert 5.0 <= cell.estimate.low < 7.5 < cell.estimate.high <= 10.0
-    assert (cell.seeds, cell.agents, cell.planned, cell.steps, cell.updates) == (2, 4, 4, 200, 2)
+    assert cell.scores == (10.0, 11.0, 20.0, 21.0)
+    assert cell.estimate.mean == 15.5
+    assert (cell.seeds, cell.agents, cell.planned, cell.failed) == (2, 4, 4, 0)
+    assert (cell.steps, cell.window) == (200, 20)
     assert cell.paper == 106.8
 
 
-def test_one_agent_has_a_mean_and_no_interval(cells):
-    assert cells[1].text == "8.0"
+def test_few_agents_have_a_range_and_no_interval(cells):
+    assert np.isnan(cells[0].estimate.low)
+    assert cells[0].text == "15.5 {10.0 to 21.0} (n 4, 0 failed, finds –)"
+    assert cells[1].text == "8.0 (n 1, 0 failed, finds –)"
     assert (cells[1].seeds, cells[1].agents, cells[1].planned) == (1, 1, 4)
+
+
+def test_ten_agents_have_an_interval_and_what_they_could_have_found(study):
+    cell = make_cells(study(lambda _, __, agent: 1.0 * agent))[0]
+    spread = np.sqrt(2) * np.std(range(10), ddof=1)
+    assert cell.detectable == pytest.approx(float(detectable_difference(spread, 10)))
+    estimate = estimate_mean(np.arange(10.0))
+    ends = f"[{estimate.low:.1f}, {estimate.high:.1f}]"
+    assert cell.text == f"4.5 {ends} (n 10, 0 failed, finds {cell.detectable:.1f})"
+
+
+def test_a_tenth_of_successes_anywhere_on_the_task_leaves_ranges(study):
+    """PPO has no success among ten, PPO reg has one."""
+
+    def reward(_task, name, agent):
+        return 500.0 if (name, agent) == ("PPO reg", 4) else 1.0 * (agent % 2)
+
+    cells = make_cells(study(reward))
+    assert [c.text.split(" (")[0] for c in cells] == ["0.5 {0.0 to 1.0}", "50.5 {0.0 to 500.0}"]
+
+
+def test_failed_agents_count_with_the_worst_of_their_task(study):
+    results = study(
+        lambda _, name, agent: agent - 20.0 * (name == "PPO reg"),
+        diverged=lambda _, name, agent: (name, agent) == ("PPO", 9),
+    )
+    plain = make_cells(results)[0]
+    assert (plain.agents, plain.failed) == (10, 1)
+    assert plain.estimate.mean == pytest.approx((sum(range(9)) - 20) / 10)
+    assert "1 failed" in plain.text
+    assert "A failed run's numbers became non-finite" in " ".join(notes(results, [plain]))
 
 
 def test_missing_cells_are_missing(cells, results):
@@ -60,16 +94,20 @@ def test_missing_cells_are_missing(cells, results):
 def test_the_notes_say_how_much_shorter_the_runs_are(cells, results):
     said = "\n".join(notes(results, cells))
     assert "Steps done: 200 to 300; the paper's runs have 5,000,000." in said
-    assert "fewer than 100: 2 to 3 here" in said
+    assert "Training scores are over the last 20 steps" in said
+    assert "Agents in a cell: 1 to 4; seeds: 1 to 2." in said
 
 
-def test_one_short_cell_among_long_ones_is_told(store, suite):
+def test_full_runs_are_not_called_short(store, suite_file):
+    suite_file.write_text(suite_file.read_text().replace("= 200", "= 5_000_000"))
+    suite = load_suite(str(suite_file))
     for spec in suite.runs:
-        write_run(store, spec, [1.0] * (2 if spec.environment == "Hopper" else 60_000))
+        write_run(store, spec, [1.0], columns={"global_step": [5_000_000]})
     results = load_results(suite, store)
     said = "\n".join(notes(results, make_cells(results)))
-    assert "Steps done: 200 to 6,000,000" in said
-    assert "2 to 100 here" in said
+    assert "Steps done" not in said
+    assert "over the last 200,000 steps" in said
+    assert not {"Missing", "Incomplete", "failed run"} & set(said.split())
 
 
 def test_runs_of_another_configuration_are_left_out_and_named(store, suite, suite_file):
@@ -92,29 +130,65 @@ def test_markdown_is_a_table_beside_the_papers_numbers(cells, results):
     lines = to_markdown(results, cells).splitlines()
     assert "| task | PPO | PPO, paper | PPO reg | PPO reg, paper |" in lines
     hopper = next(line for line in lines if line.startswith("| Hopper"))
-    assert hopper.startswith("| Hopper | 7.5 [")
-    assert hopper.endswith("] | 106.8 | 8.0 | 18.6 |")
+    assert hopper.startswith("| Hopper | 15.5 {")
+    assert hopper.endswith(") | 106.8 | 8.0 (n 1, 0 failed, finds –) | 18.6 |")
     assert "| Reacher | – | -13.5 | – | -7.4 |" in lines
-    assert "| Hopper | PPO | 4 of 4 | 2 | 200 | 2 |" in lines
-    assert "| Reacher | PPO | 0 of 4 | 0 | 0 | 0 |" in lines
+    assert "| Hopper | PPO | 4 of 4 | 0 | 2 | 200 | 20 |" in lines
+    assert "| Reacher | PPO | 0 of 4 | 0 | 0 | 0 | 20 |" in lines
+    assert lines[2].startswith("Training score: mean return of the episodes that ended in")
 
 
 def test_the_frame_has_a_row_for_each_cell(cells):
     frame = to_frame(cells)
-    assert list(frame["mean"].dropna()) == [7.5, 8.0]
-    assert {"low", "high", "seeds", "agents", "steps", "paper"} <= set(frame.columns)
+    assert list(frame["mean"].dropna()) == [15.5, 8.0]
+    columns = {"low", "high", "seeds", "agents", "failed", "steps", "window", "detectable", "paper"}
+    assert columns <= set(frame.columns)
 
 
-def test_the_terminal_shows_every_task(cells, results):
-    console = Console(record=True, width=120)
+def test_the_terminal_shows_every_task_with_the_papers_number_below(cells, results):
+    console = Console(record=True, width=160)
     console.print(to_rich(results, cells))
-    text = console.export_text()
-    assert "Hopper" in text
-    assert "106.8" in text
+    lines = console.export_text().splitlines()
+    hopper = next(i for i, line in enumerate(lines) if "Hopper" in line)
+    assert "15.5 {10.0 to 21.0} (n 4, 0 failed, finds –)" in lines[hopper]
+    assert "paper 106.8" in lines[hopper + 1]
+    assert "paper 18.6" in lines[hopper + 1]
+    reacher = next(i for i, line in enumerate(lines) if "Reacher" in line)
+    assert "paper -13.5" in lines[reacher + 1]
 
 
-def test_every_number_of_the_paper_is_there():
-    paper = paper_numbers("table1")
-    tasks = set(load_suite("table1").environments)
-    for algorithm in ("PPO", "PPO reg", "TRPO", "TRPO reg"):
-        assert set(paper[algorithm]) == tasks
+def test_the_terminal_shows_intervals_in_their_brackets(study):
+    results = study(lambda _, __, agent: 1.0 * agent)
+    console = Console(record=True, width=160)
+    console.print(to_rich(results, make_cells(results)))
+    assert make_cells(results)[0].text in console.export_text()
+
+
+# --- final policies -------------------------------------------------------------------------------
+
+
+def test_the_final_table_is_of_deterministic_episodes_without_the_papers_numbers(study):
+    results = study(lambda *_: 1.0, final=lambda _, __, agent: 100.0 + agent)
+    cells = make_cells(results, "final")
+    assert [c.estimate.mean for c in cells] == [104.5, 104.5]
+    header, rows = to_rows(results.suite, cells)
+    assert header == ["task", "PPO", "PPO reg"]
+    assert len(rows[0]) == 3
+    assert "Final policy" in to_markdown(results, cells, "final")
+
+
+def test_without_evaluations_the_final_table_is_empty(study):
+    cells = make_cells(study(lambda *_: 1.0), "final")
+    assert [c.agents for c in cells] == [0, 0]
+
+
+def test_the_zoos_agents_stand_beside_strongs_final_policies(store):
+    results = load_results(load_suite("strong"), store)
+    cells = make_cells(results, "final")
+    header, rows = to_rows(results.suite, cells)
+    assert header == ["task", "PPO", "PPO, zoo", "PPO reg", "TRPO", "TRPO, zoo", "TRPO reg"]
+    found = {row[0]: (row[2], row[5]) for row in rows}
+    assert found["Hopper"] == ("2575 ± 223", "2565 ± 410")
+    assert found["Reacher"] == ("17.1 ± 11", "14.7 ± 11.6")
+    assert found["Humanoid"] == ("", "")
+    assert not any(c.zoo for c in make_cells(results))

@@ -1,0 +1,153 @@
+"""Claim (d), from episodes with known rates."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from harness.report.claims import generalization_claim
+from harness.report.results import load_results
+from harness.suite import load_suite
+from tests.harness.conftest import make_episodes, write_run
+
+PLAIN = [[1, 0], [0, 0]]  # 1/4
+BETTER, WORSE = [[1, 1], [0, 0]], [[0, 0], [0, 0]]  # 1/2, 0
+
+
+def episodes(seen, unseen, greedy=((1,), (0,))):
+    return make_episodes(
+        seen_sampled=seen, unseen_sampled=unseen, seen_greedy=greedy, unseen_greedy=greedy
+    )
+
+
+def both_levels(rate: int) -> list[list[int]]:
+    """4 levels of 4 repeats, each won `rate` times of 4."""
+    return [[1] * rate + [0] * (4 - rate)] * 4
+
+
+def claim_of(store, reg, seeds=10, plain=lambda _: 1, leave_out=()):
+    """Agents win `plain(seed)` of 4 repeats on each level, and `reg(seed)` with the penalty."""
+    suite = load_suite("table2", seeds=seeds)
+    for run in suite.runs:
+        seed = run.args["seed"]
+        if (run.algorithm, seed) in leave_out:
+            continue
+        rates = reg(seed) if run.algorithm.endswith(" reg") else plain(seed)
+        seen, unseen = rates if isinstance(rates, tuple) else (rates, rates)
+        write_run(store, run, [0.0], episodes=episodes(both_levels(seen), both_levels(unseen)))
+    return generalization_claim(load_results(suite, store))
+
+
+def gain(seed: int) -> int:
+    """2 or 3 of 4, where the plain agents have 1."""
+    return 2 + seed % 2
+
+
+@pytest.mark.parametrize(
+    ("reg", "expected", "gains"),
+    [
+        (gain, "supported", (0.375, 0.375)),
+        (lambda seed: 0, "contradicted", (-0.25, -0.25)),
+        (lambda seed: 1, "undecided", (0.0, 0.0)),
+        (lambda seed: (gain(seed), 1), "undecided", (0.375, 0.0)),
+        (lambda seed: (gain(seed), 0), "undecided", (0.375, -0.25)),
+    ],
+)
+def test_the_verdict_is_where_all_gains_are(store, reg, expected, gains):
+    claim = claim_of(store, reg)
+    assert (claim.letter, claim.verdict) == ("d", expected)
+    assert len(claim.findings) == 4 * 2  # pairs of agents, seen and unseen
+    assert [f.estimate.mean for f in claim.findings] == pytest.approx([*gains] * 4)
+    assert {f.estimate.n for f in claim.findings} == {10}
+    assert {f.note for f in claim.findings} == {"interval over training runs and levels"}
+    first, second = claim.findings[:2]
+    assert (first.task, first.about) == ("PPO", "reg - plain: success, seen levels")
+    assert (second.task, second.about) == ("PPO", "reg - plain: success, unseen levels")
+
+
+def test_p_is_corrected_over_all_eight_columns(store):
+    claim = claim_of(store, lambda seed: (gain(seed), seed % 3), seeds=6)
+    p = sorted(f.p for f in claim.findings)
+    corrected = sorted(f.p_holm for f in claim.findings)
+    assert corrected[0] == pytest.approx(8 * p[0])
+    assert corrected[4] == pytest.approx(min(1.0, 4 * p[4]))
+
+
+@pytest.mark.parametrize(
+    ("seeds", "word"), [(1, "one training run"), (2, "2 training runs"), (4, "4 training runs")]
+)
+def test_below_five_training_runs_the_verdict_says_how_many(store, seeds, word):
+    claim = claim_of(store, gain, seeds=seeds)
+    assert claim.verdict == word
+    assert {f.verdict for f in claim.findings} == {word}
+    assert {f.note for f in claim.findings} == {"interval over levels only"}
+    assert np.isnan([f.p for f in claim.findings]).all()
+
+
+def test_five_training_runs_have_a_verdict(store):
+    assert claim_of(store, lambda _: 4, seeds=5).verdict == "supported"
+
+
+def test_the_pair_with_the_fewest_runs_speaks_for_all(store):
+    missing = [("PPO-D reg", seed) for seed in range(2, 11)]
+    assert claim_of(store, gain, leave_out=missing).verdict == "one training run"
+
+
+def test_a_pair_that_has_not_run_leaves_the_claim_open(store):
+    missing = [("PPO-D", seed) for seed in range(1, 11)]
+    claim = claim_of(store, gain, leave_out=missing)
+    assert claim.verdict == "undecided"
+    assert [f.note for f in claim.findings if f.task == "PPO-D"] == ["no pair yet"] * 2
+
+
+def test_only_seeds_that_both_have_are_compared(store):
+    """Seed 3 has no regularized agent, seed 4 no plain one."""
+    suite = load_suite("table2", seeds=4)
+    rates = {1: PLAIN, 2: PLAIN, 3: BETTER, 4: WORSE}
+    for run in suite.runs:
+        seed, reg = run.args["seed"], run.algorithm.endswith(" reg")
+        if seed != (3 if reg else 4):
+            found = BETTER if reg else rates[seed]
+            write_run(store, run, [0.0], episodes=episodes(found, found))
+    claim = generalization_claim(load_results(suite, store))
+    assert {(f.estimate.mean, f.estimate.n) for f in claim.findings} == {(0.25, 2)}
+
+
+def test_levels_are_paired(store):
+    """Gains of 1/2 on every level, however much levels differ: no doubt over levels is left."""
+    suite = load_suite("table2")
+    hard, easy = [[0, 0], [1, 0]], [[1, 0], [1, 1]]
+    for run in suite.runs:
+        found = easy if run.algorithm.endswith(" reg") else hard
+        write_run(store, run, [0.0], episodes=episodes(found, found))
+    claim = generalization_claim(load_results(suite, store))
+    assert {f.estimate[:3] for f in claim.findings} == {(0.5, 0.5, 0.5)}
+
+
+def test_greedy_episodes_do_not_move_the_claim(store):
+    suite = load_suite("table2")
+    for run in suite.runs:
+        greedy = [[run.algorithm.endswith(" reg")]] * 2
+        write_run(store, run, [0.0], episodes=episodes(PLAIN, PLAIN, greedy))
+    claim = generalization_claim(load_results(suite, store))
+    assert {f.estimate.mean for f in claim.findings} == {0.0}
+
+
+def test_the_basis_is_the_papers_fifty_million_steps(store):
+    assert claim_of(store, gain).basis == "at 0.0002% of the paper's length (100 steps)"
+
+
+def test_unseen_themes_are_a_column_of_the_claim(store):
+    """PPO is right in a half of the levels with all themes, PPO reg in three of four."""
+    suite = load_suite("themes", seeds=1)
+    for run in suite.runs:
+        won = [[1, 1], [1, 0]] if run.algorithm == "PPO reg" else [[1, 0], [0, 1]]
+        found = [episodes(PLAIN, PLAIN), make_episodes(themes_sampled=won)]
+        write_run(store, run, [1.0], episodes=pd.concat(found))
+    claim = generalization_claim(load_results(suite, store))
+    assert {f.about: f.estimate.mean for f in claim.findings} == {
+        "reg - plain: success, seen levels": 0.0,
+        "reg - plain: success, unseen levels": 0.0,
+        "reg - plain: success, themes levels": 0.25,
+    }
