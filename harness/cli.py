@@ -1,4 +1,4 @@
-"""The command line: python -m harness run-all | list | status | evaluate | report."""
+"""The command line: python -m harness run-all | list | status | evaluate | cost | report."""
 
 from __future__ import annotations
 
@@ -18,13 +18,15 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from harness.cost import IMPLEMENTATIONS, CostError, measure_in_turn
 from harness.estimate import Cost, EstimateError, measure
 from harness.launchers.groups import make_groups
 from harness.launchers.local import Outcome, cores, run_local
 from harness.progress import Progress, duration
+from harness.report.cost import measured_in_turn
 from harness.report.page import write_report
-from harness.report.results import Results, load_results
-from harness.schema import SuiteError, Unseen, suite_names
+from harness.report.results import TIMED, Results, load_results
+from harness.schema import SuiteError, Unseen, check_known, suite_names
 from harness.statistics import estimate_success, success_matrix
 from harness.store import STATES, EvaluationError, Store, StoreError
 from harness.suite import load_suite
@@ -223,6 +225,39 @@ def report(
     make_report(load_results(plan, store), store)
 
 
+@app.command(name="cost")
+def cost(
+    implementation: tuple[str, ...] = ("single file", "population"),
+    env: tuple[str, ...] = ("Hopper",),
+    repetitions: int = 10,
+    updates: int = 6,
+    results_dir: Path = Path("results"),
+) -> None:
+    """Measure what the penalty costs: plain and regularized runs in turn, on this machine alone.
+
+    The report's claim (e) is of this measurement where there is one. Run nothing beside it.
+
+    Args:
+        implementation: "single file", "compiled" (PPO; needs a C++ compiler) and "population".
+        env: Tasks, by the names that the suite table1 uses.
+        repetitions: Pairs of runs; from 6 on they have an interval.
+        updates: Of each run, 2000 steps each; the first is not counted.
+        results_dir: Where cost.csv goes, beside the suites' results.
+    """
+    plan = load_suite("table1", env=env)
+    ids = {run.environment: run.args["env_id"] for run in plan.runs}
+    check_known(dict.fromkeys(implementation), set(IMPLEMENTATIONS), "implementation")
+    timed = measure_in_turn(ids, list(implementation), repetitions, updates, say)
+    results_dir.mkdir(parents=True, exist_ok=True)
+    timed.to_csv(results_dir / TIMED, index=False)
+    for finding in measured_in_turn(timed):
+        mean, low, high, n = finding.estimate
+        say(
+            f"{finding.task}, {finding.about}: {100 * mean:+.1f}% [{100 * low:+.1f}, "
+            f"{100 * high:+.1f}], n {n}: {finding.verdict}"
+        )
+
+
 def make_report(results: Results, store: Store) -> None:
     """Print the table and the verdicts, and write the whole report to results/<suite>/report/."""
     folder = store.report_path(results.suite.name)
@@ -280,7 +315,7 @@ def main() -> None:
         signal.signal(signal.SIGHUP, signal.default_int_handler)
     try:
         app.cli(prog="python -m harness", description=__doc__)
-    except (SuiteError, StoreError, EvaluationError, EstimateError) as error:
+    except (SuiteError, StoreError, EvaluationError, EstimateError, CostError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         say("\nInterrupted: the same command continues from the runs' last checkpoints.")

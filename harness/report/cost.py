@@ -28,21 +28,12 @@ KEYS = ["kind", "plain", "implementation", "machine", "environment", "seed"]
 
 
 def cost_claim(results: Results) -> Claim:
-    """Claim (e): time for a step with the penalty over without it, less 1.
+    """Claim (e): time for a step with the penalty over without it, less 1, by implementation.
 
-    A pair is a task and a seed, both arms trained by one implementation on one machine: the agents
-    of a seed may have shared one process, so their mean counts once. The runs must have shared
-    their machine alike for this to mean anything; `python -m harness cost` measures it in turn.
+    Where `python -m harness cost` has measured both arms in turn, the verdict is of that. Else it
+    is of the suite's own runs, which must have shared their machine alike to mean anything.
     """
-    times = step_times(results)
-    findings = []
-    if len(times):
-        wide = times.pivot_table(index=KEYS, columns="arm", values="seconds")
-        wide = wide.reindex(columns=["plain", "reg"]).dropna()
-        added = wide["reg"] / wide["plain"] - 1
-        for (kind, plain, implementation), group in added.groupby(KEYS[:3], sort=False):
-            about = f"reg / plain - 1: time for a step, {kind}, {implementation}"
-            findings.append(added_time(about, plain, group.to_numpy()))
+    findings = from_runs(results) if results.timed is None else measured_in_turn(results.timed)
     steps = [
         results.metrics[run.run_id]["global_step"].iloc[-1]
         for run in results.suite.runs
@@ -51,6 +42,37 @@ def cost_claim(results: Results) -> Claim:
     verdict = agreed([finding.verdict for finding in findings]) if findings else UNDECIDED
     basis = basis_of(steps, paper_numbers("table1")["timesteps"])
     return Claim("e", STATEMENT, verdict, findings, basis)
+
+
+def measured_in_turn(timed: pd.DataFrame) -> list[Finding]:
+    """A finding for each algorithm, implementation and task, over repetitions."""
+    findings = []
+    for key, group in timed.groupby(["algorithm", "implementation", "environment"]):
+        algorithm, implementation, environment = key
+        about = f"reg / plain - 1: time for a step, in turn, {environment}, {implementation}"
+        added = group["reg"] / group["plain"] - 1
+        findings.append(added_time(about, algorithm, added.to_numpy()))
+    return findings
+
+
+def from_runs(results: Results) -> list[Finding]:
+    """A finding for each algorithm and implementation, from the speeds that the runs logged.
+
+    A pair is a task and a seed, both arms trained by one implementation on one machine: the agents
+    of a seed may have shared one process, so their mean counts once.
+    """
+    times = step_times(results)
+    if not len(times):
+        return []
+    wide = times.pivot_table(index=KEYS, columns="arm", values="seconds")
+    wide = wide.reindex(columns=["plain", "reg"]).dropna()
+    added = wide["reg"] / wide["plain"] - 1
+    return [
+        added_time(
+            f"reg / plain - 1: time for a step, {kind}, {implementation}", plain, group.to_numpy()
+        )
+        for (kind, plain, implementation), group in added.groupby(KEYS[:3], sort=False)
+    ]
 
 
 def added_time(about: str, algorithm: str, added: np.ndarray) -> Finding:

@@ -11,6 +11,8 @@ import pandas as pd
 from harness.store import Store, read_json
 from harness.suite import Suite
 
+TIMED = "cost.csv"  # in the results' folder
+
 
 @dataclasses.dataclass(frozen=True)
 class Results:
@@ -31,6 +33,8 @@ class Results:
     """what became non-finite, and when, by run id: an outcome, no missing run"""
     specs: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
     """what each run says of itself: its implementation and its machine among it"""
+    timed: pd.DataFrame | None = None
+    """what `python -m harness cost` has measured, if it has"""
 
     def part(self, evaluated: bool) -> Results:
         """The runs that are evaluated on levels, or the others: the control tasks."""
@@ -100,4 +104,5 @@ def load_results(suite: Suite, store: Store) -> Results:
             if (path := store.path(run, "evaluation.csv")).exists():
                 evaluations[run.run_id] = pd.read_csv(path)
     folders = {run.run_id: store.path(run) for run in suite.runs}
-    return Results(suite, metrics, changed, done, evaluations, folders, diverged, specs)
+    timed = pd.read_csv(path) if (path := store.root / TIMED).exists() else None
+    return Results(suite, metrics, changed, done, evaluations, folders, diverged, specs, timed)

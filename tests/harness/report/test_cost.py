@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from harness.report.cost import added_time, cost_claim
@@ -95,3 +96,20 @@ def test_without_pairs_there_is_no_finding(store):
     suite = load_suite("figure1")
     claim = cost_claim(load_results(suite, store))
     assert (claim.findings, claim.verdict) == ([], "undecided")
+
+
+def test_what_was_measured_in_turn_has_the_say(store):
+    """The runs' own speeds say +20%; the six repetitions say +2%."""
+    timed = pd.DataFrame(
+        {
+            "algorithm": "PPO", "implementation": "population", "environment": "Hopper",
+            "repetition": range(6), "plain": 1e-3, "reg": 1.02e-3,
+        }
+    )  # fmt: skip
+    store.root.mkdir(parents=True)
+    timed.to_csv(store.root / "cost.csv", index=False)
+    claim = claim_of(store, lambda *_: 1000 / 1.2)
+    (finding,) = claim.findings
+    assert finding.about.endswith("in turn, Hopper, population")
+    assert finding.estimate.mean == pytest.approx(0.02)
+    assert claim.verdict == "supported"
