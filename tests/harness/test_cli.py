@@ -238,8 +238,26 @@ def test_report_of_an_unfinished_suite(run_cli, store, suite, suite_file):
     write_run(store, suite.runs[0], [1.0, 2.0])
     status, out = run_cli("report", "--suite", suite_file, "--results-dir", store.root)
     assert status == 0
-    assert "1.5" in out
+    assert "2.0 (n 1, 0 failed, finds –)" in out
     assert "Missing" in out
+
+
+def test_cost_says_what_was_added_and_keeps_it(run_cli, tmp_path, monkeypatch):
+    timed = pd.DataFrame(
+        {
+            "algorithm": "PPO", "implementation": "population", "environment": "Hopper",
+            "repetition": range(6), "plain": 1e-3, "reg": 1.05e-3,
+        }
+    )  # fmt: skip
+    asked = []
+    monkeypatch.setattr(cli, "measure_in_turn", lambda *given: asked.append(given) or timed)
+    status, out = run_cli("cost", "--env", "Hopper", "--results-dir", tmp_path / "new")
+    assert status == 0
+    assert "+5.0% [+5.0, +5.0], n 6: supported" in out
+    assert len(pd.read_csv(tmp_path / "new" / "cost.csv")) == 6
+    ids, implementations, repetitions, updates, _ = asked[0]
+    assert list(ids) == ["Hopper"]
+    assert (implementations, repetitions, updates) == (["single file", "population"], 10, 6)
 
 
 @pytest.mark.parametrize(
@@ -247,6 +265,7 @@ def test_report_of_an_unfinished_suite(run_cli, store, suite, suite_file):
     [
         (["run-all", "--suite", "tabel1"], "no suite 'tabel1'"),
         (["run-all", "--env", "Hoper"], "Hopper?"),
+        (["cost", "--implementation", "populatoin"], "population?"),
         (["run-all", "--jobs", "0"], "jobs must be at least 1, got 0"),
         (["run-all", "--total-timesteps", "5"], "total_timesteps must be at least"),
     ],

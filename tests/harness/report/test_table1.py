@@ -167,7 +167,7 @@ def test_the_terminal_shows_intervals_in_their_brackets(study):
 # --- final policies -------------------------------------------------------------------------------
 
 
-def test_the_final_table_is_of_deterministic_episodes_without_the_papers_numbers(study):
+def test_the_final_table_is_of_deterministic_episodes_alone(study):
     results = study(lambda *_: 1.0, final=lambda _, __, agent: 100.0 + agent)
     cells = make_cells(results, "final")
     assert [c.estimate.mean for c in cells] == [104.5, 104.5]
