@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import re
@@ -10,6 +11,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from harness.identity import identify, resolve
 from harness.schema import SuiteError, check_args, check_keys, check_known, fits, read
 
 ALGORITHM_KEYS = {"name", "baseline", "args", "environments"}
@@ -35,15 +37,28 @@ class RunSpec:
 
     @property
     def run_id(self) -> str:
-        algorithm = re.sub(r"\W+", "-", self.algorithm.lower())
-        return f"{algorithm}__{self.environment}__s{self.args['seed']}__a{self.args['agent']}"
+        seed, agent = self.args["seed"], self.args["agent"]
+        return f"{slug(self.algorithm)}__{self.environment}__s{seed}__a{agent}"
+
+    @property
+    def resolved(self) -> dict[str, Any]:
+        """All arguments, the baseline's defaults included."""
+        return resolve(self.baseline, self.args)
+
+    @functools.cached_property
+    def identity(self) -> dict[str, Any]:
+        """All that decides the run's numbers: see harness.identity."""
+        return identify(self.baseline, self.args, self.evaluation)
 
     @property
     def hash(self) -> str:
-        """Tells a changed configuration from a finished one."""
-        settings = [self.baseline, self.args, *([self.evaluation] if self.evaluation else [])]
-        content = json.dumps(settings, sort_keys=True)
+        """Of the identity, so that runs of the same settings are found among many."""
+        content = json.dumps(self.identity, sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()
+
+    def with_args(self, **changes: Any) -> RunSpec:
+        """The same run with other arguments."""
+        return dataclasses.replace(self, args={**self.args, **changes})
 
     @property
     def flags(self) -> list[str]:
@@ -57,6 +72,11 @@ class RunSpec:
                 values = value if isinstance(value, list) else [value]
                 flags += [f"--{flag}", *map(str, values)]
         return flags
+
+
+def slug(name: str) -> str:
+    """An algorithm's name as part of a file's name."""
+    return re.sub(r"\W+", "-", name.lower())
 
 
 @dataclasses.dataclass(frozen=True)

@@ -90,17 +90,19 @@ def test_status_counts_states(run_cli, store, suite, suite_file):
     status, out = run_cli("status", "--suite", suite_file, "--results-dir", store.root)
     row = next(line for line in out.splitlines() if "tiny" in line)
     assert status == 0
-    assert [int(x) for x in row.replace("│", " ").split()[1:7]] == [1, 0, 0, 1, 14, 0]
+    assert [int(x) for x in row.replace("│", " ").split()[1:8]] == [1, 0, 0, 0, 1, 14, 0]
     assert "200 of 3,200" in row
 
 
 def test_status_goes_on_where_the_settings_were_others(run_cli, store, suite):
-    changed = dataclasses.replace(suite.runs[0], suite="smoke", args=suite.runs[0].args | {"x": 1})
+    changed = dataclasses.replace(
+        suite.runs[0], suite="smoke", args=suite.runs[0].args | {"gamma": 0.5}
+    )
     write_run(store, changed, [1.0])
     status, out = run_cli("status", "--results-dir", store.root)
     row = next(line for line in out.splitlines() if "smoke" in line)
     assert status == 0
-    assert row.replace("│", " ").split()[6] == "1"
+    assert row.replace("│", " ").split()[7] == "1"
     assert "table1" in out
 
 

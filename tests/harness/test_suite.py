@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import importlib
 import json
 from collections import Counter
@@ -350,13 +349,6 @@ def test_an_evaluation_is_of_every_run_and_in_its_hash(tmp_path):
     assert not {run.hash for run in plain} & {run.hash for run in evaluated}
     more = dataclasses.replace(evaluated[0], evaluation={"levels": 4, "repeats": 2})
     assert more.hash != evaluated[0].hash
-
-
-def test_the_hash_of_a_run_that_is_not_evaluated_is_of_its_baseline_and_arguments(suite):
-    """Runs of the suites without levels, made before there were any, stay what they are."""
-    run = suite.runs[0]
-    content = json.dumps([run.baseline, run.args], sort_keys=True)
-    assert run.hash == hashlib.sha256(content.encode()).hexdigest()
 
 
 def including(tmp_path, names, own: str = "", name: str = "union") -> str:
