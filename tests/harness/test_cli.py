@@ -9,33 +9,11 @@ import sys
 import pandas as pd
 import pytest
 
-from harness import cli
 from harness.evaluation import runs
 from harness.launchers.local import ROOT
 from harness.schema import suite_names
 from harness.suite import load_suite
 from tests.harness.conftest import make_episodes, write_run
-
-
-@pytest.fixture
-def run_cli(monkeypatch, capsys):
-    """Run a command in this process; gives its exit status and output."""
-
-    def run(*words: object) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["harness", *map(str, words)])
-        monkeypatch.setattr(cli.console, "width", 200)
-        status = 0
-        try:
-            cli.main()
-        except SystemExit as stopped:
-            status = stopped.code if isinstance(stopped.code, int) else 1
-            message = "" if isinstance(stopped.code, int) else str(stopped.code)
-        else:
-            message = ""
-        captured = capsys.readouterr()
-        return status, captured.out + captured.err + message
-
-    return run
 
 
 @pytest.fixture
