@@ -110,9 +110,7 @@ def load_results(suite: Suite, store: Store) -> Results:
             scores[run.run_id] = exact_scores(found, run.args["total_timesteps"])
             specs[run.run_id] = store.saved(run) or {}
 
-    diverged = {
-        k: r.done["diverged"]["message"] for k, r in records.items() if r.state == "diverged"
-    }
+    diverged = {k: x.done["diverged"] for k, x in records.items() if x.state == "diverged"}
     evaluations = {k: r.evaluation for k, r in records.items() if r.evaluation is not None}
     return Results(
         suite=suite,
