@@ -132,14 +132,18 @@ def load_suite(
     for other, its in included:
         if "include" in its:
             raise SuiteError(f"{path.name} includes {other.stem}, which includes others: name them")
+
     files = [(p, d) for p, d in [(path, data), *included] if "algorithms" in d]
-    there = {environment for _, d in files for environment in d["environments"]}
-    check_known(dict.fromkeys(env), there, "environment")
+    known = {environment for _, d in files for environment in d["environments"]}
+    check_known(dict.fromkeys(env), known, "environment")
+
     parts = [_own_runs(p, _scaled(d, total_timesteps, seeds, agents, env)) for p, d in files]
     found: dict[tuple[str, ...], RunSpec] = {}
-    for run in (run for part in parts for run in part.runs):
-        found.setdefault((run.algorithm, run.environment, run.hash), run)
-    runs = list(found.values())  # what several suites have is run once, by the first of them
+    for part in parts:
+        for run in part.runs:  # what several suites have is run once, by the first of them
+            found.setdefault((run.algorithm, run.environment, run.hash), run)
+
+    runs = list(found.values())
     if not runs:
         raise SuiteError(f"{path.name} has no runs: it needs algorithms, environments and seeds")
     if len({run.run_id for run in runs}) < len(runs):
@@ -163,14 +167,26 @@ def _scaled(
     agents: int | None,
     env: tuple[str, ...],
 ) -> dict[str, Any]:
-    more = range(max(data["seeds"]) + 1, max(data["seeds"]) + 1 + (seeds or 0))
-    steps = {"total_timesteps": total_timesteps} if total_timesteps else {}
+    """The suite's data with what the command line asks for instead."""
+    own_seeds = data["seeds"]
+    if seeds is not None:
+        first = max(own_seeds) + 1  # of those that follow the suite's own
+        own_seeds = [*own_seeds, *range(first, first + seeds)][:seeds]
+
+    args = data["args"]
+    if total_timesteps is not None:
+        args = {**args, "total_timesteps": total_timesteps}
+
+    environments = data["environments"]
+    if env:
+        environments = {name: x for name, x in environments.items() if name in env}
+
     return {
         **data,
-        "seeds": [*data["seeds"], *more][:seeds] if seeds else data["seeds"],
-        "agents": agents or data["agents"],
-        "args": {**data["args"], **steps},
-        "environments": {k: v for k, v in data["environments"].items() if k in env or not env},
+        "seeds": own_seeds,
+        "agents": data["agents"] if agents is None else agents,
+        "args": args,
+        "environments": environments,
         "all_environments": set(data["environments"]),
     }
 
