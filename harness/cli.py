@@ -143,14 +143,18 @@ def status(
         archives: Where archives of finished runs are.
     """
     store = Store(results_dir, archives)
-    table = Table("suite", *STATES, "steps")
+    rows: dict[str, tuple[Counter[str], str]] = {}
     for name in suite or suite_names():
         plan = load_suite(name)
         states = {run.run_id: store.state(run) for run in plan.runs}
         steps = sum(store.steps(run) for run in plan.runs if states[run.run_id] != "changed")
-        counts = Counter(states.values())
-        numbers = [str(counts[state]) for state in STATES]
-        table.add_row(plan.name, *numbers, f"{steps:,} of {plan.timesteps:,}")
+        rows[plan.name] = Counter(states.values()), f"{steps:,} of {plan.timesteps:,}"
+
+    always = {"done", "pending"}
+    shown = [x for x in STATES if x in always or any(counts[x] for counts, _ in rows.values())]
+    table = Table("suite", *shown, "steps")
+    for name, (counts, done) in rows.items():
+        table.add_row(name, *[str(counts[state]) for state in shown], done)
     console.print(table)
 
 

@@ -53,32 +53,42 @@ def pack(plan: Suite, store: Store, root: Path, with_checkpoints: bool) -> Itera
 
 def _pack(specs: list[RunSpec], store: Store, root: Path, with_checkpoints: bool) -> Path | None:
     """Write the runs, and the shorter ones that they continue, that no archive holds yet."""
-    records: list[Record] = []
-    places: dict[Path, list[RunSpec]] = {}  # which archive holds which of the runs
     path = archive_path(root, specs[0])
+    fresh: list[Record] = []
+    held: dict[Path, list[RunSpec]] = {}  # which file holds which of the runs
     for spec in specs:
-        record = store.record(spec)
         archived = store.archives.find(spec)
-        if record is not None and archived is None:
+        record = store.record(spec)
+        if archived is None and record is not None:
             _verify(spec, record, store)
-            records.append(record)
-        places.setdefault(path if archived is None else archived.place, []).append(spec)
-        records += _shorter(spec, store)
+            fresh.append(record)
+        held.setdefault(archived.place if archived else path, []).append(spec)
+        fresh += _shorter(spec, store)
 
-    if records:
-        write_archive(path, records)
-    for place, found in places.items() if with_checkpoints else ():
-        if not checkpoints_path(place).exists():
-            files = {spec.run_id: store.path(spec, "checkpoint.pt") for spec in found}
-            there = {run_id: file for run_id, file in files.items() if file.exists()}
-            write_checkpoints(place, there)
-    return path if records else None
+    if fresh:
+        write_archive(path, fresh)
+    if with_checkpoints:
+        for place, found in held.items():
+            if not checkpoints_path(place).exists():
+                write_checkpoints(place, _checkpoints(found, store))
+    return path if fresh else None
+
+
+def _checkpoints(specs: list[RunSpec], store: Store) -> dict[str, Path]:
+    """The final checkpoint of each run, by run id; a run that was extended since has another."""
+    found = {}
+    for spec in specs:
+        record, path = store.record(spec), store.path(spec, "checkpoint.pt")
+        if record and path.exists() and checksum(path) == record.files.get("checkpoint.pt"):
+            found[spec.run_id] = path
+    return found
 
 
 def _shorter(spec: RunSpec, store: Store) -> list[Record]:
     """What the run left at each shorter length that it was continued from."""
     found = []
-    for length in store.shorter_lengths(spec):
+    lengths = [n for n in store.shorter_lengths(spec) if n < spec.args["total_timesteps"]]
+    for length in lengths:
         before = spec.with_args(total_timesteps=length)
         record = store.own_record(before)
         if record is not None and store.archives.find(before) is None:

@@ -263,14 +263,16 @@ class Store:
 
     def steps(self, spec: RunSpec) -> int:
         """Environment steps done, cheaply: from the last whole line of metrics.csv."""
+        total = spec.args["total_timesteps"]
         try:
             with open(self.path(spec, "metrics.csv"), "rb") as file:
                 file.seek(max(0, os.fstat(file.fileno()).st_size - 4096))
                 lines = file.read().split(b"\n")[:-1]
         except FileNotFoundError:
-            return 0
+            archived = self.archives.find(spec)
+            return int(archived.scores.get("steps", 0)) if archived else 0
         first = lines[-1].split(b",")[0] if lines else b""
-        return int(first) if first.isdigit() else 0
+        return min(int(first), total) if first.isdigit() else 0  # it may have been extended since
 
     def log_tail(self, spec: RunSpec, lines: int = 15) -> str:
         try:

@@ -22,21 +22,21 @@ class Results:
     suite: Suite
     metrics: dict[str, pd.DataFrame]
     """rows for drawing: all updates, or means over blocks of them"""
-    scores: dict[str, dict[str, float]]
-    """exact numbers from every row, as `harness.scores` names them; also of runs under way"""
     changed: list[str]
     """ids of runs that were made by another configuration: left out"""
     done: list[str]
     """ids of runs that are complete, those that diverged too"""
-    diverged: dict[str, dict[str, Any]]
-    """update, what and message of the runs that diverged, by run id"""
     evaluations: dict[str, pd.DataFrame]
     """episodes of the final policy, by run id, of the runs that were evaluated: on seen and unseen
     levels, or on a control task"""
     folders: dict[str, Path]
     """where each run's files are, or would be, by run id"""
-    specs: dict[str, dict[str, Any]]
+    diverged: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
+    """update, what and message of the runs that diverged, by run id"""
+    specs: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
     """content of each run's spec.json, by run id"""
+    scores: dict[str, dict[str, float]] = dataclasses.field(default_factory=dict)
+    """exact numbers from every row, as `harness.scores` names them; also of runs under way"""
 
     @property
     def origins(self) -> Origins:

@@ -45,8 +45,12 @@ Reacher = "MountainCarContinuous-v0"
 
 
 @pytest.fixture
-def run_cli(monkeypatch, capsys):
-    """Run a command in this process; gives its exit status and output."""
+def run_cli(monkeypatch, capsys, tmp_path):
+    """Run a command in this process, away from the checkout's results and archives.
+
+    Gives its exit status and output.
+    """
+    monkeypatch.chdir(tmp_path)
 
     def run(*words: object) -> tuple[int, str]:
         monkeypatch.setattr(sys, "argv", ["harness", *map(str, words)])

@@ -270,6 +270,18 @@ def test_the_shorter_run_of_an_extended_one_is_archived_too(store, suite, runs, 
     assert archives.lengths(long).keys() == {25_000, 50_000}
 
 
+def test_a_checkpoint_of_a_longer_run_is_not_taken_for_the_shorter_ones(store, suite, runs, root):
+    short, long = (runs[0].with_args(total_timesteps=n) for n in (25_000, 50_000))
+    write_run(store, short, np.zeros(250))
+    write_run(store, long, np.zeros(500))
+    store.path(long, "checkpoint.pt").write_bytes(b"longer")
+    packed(dataclasses.replace(suite, runs=[short]), store, root, with_checkpoints=True)
+    (record,) = read_archive(root / "tiny" / "ppo__Hopper.jsonl.xz")
+    assert record.total_timesteps == 25_000
+    with pytest.raises(ArchiveError, match="holds no checkpoint of ppo__Hopper__s1__a0"):
+        read_checkpoint(record)
+
+
 # --- in place of the runs ------------------------------------------------------------------------
 
 
@@ -293,7 +305,7 @@ def test_run_all_runs_only_what_is_not_archived(run_cli, elsewhere, runs, suite_
     words = ["--suite", suite_file, "--results-dir", elsewhere.root, "--archives", root]
     status, out = run_cli("status", *words)
     row = next(line for line in out.splitlines() if "tiny" in line)
-    assert row.replace("│", " ").split()[1] == "4"
+    assert row.replace("│", " ").split() == ["tiny", "4", "12", "100,000", "of", "3,200"]
     status, out = run_cli("run-all", *words, "--dry-run", "--env", "Hopper", "--seeds", 1)
     assert status == 0, out
     assert "4 runs, 800 steps; 2 done before, 2 to do" in out
