@@ -1,10 +1,8 @@
-"""The command line: python -m harness run-all | list | status | evaluate | cost | report."""
+"""The command line: run-all | list | status | evaluate | archive | cost | report."""
 
 from __future__ import annotations
 
 import dataclasses
-import functools
-import math
 import signal
 import sys
 from collections import Counter
@@ -15,34 +13,52 @@ from typing import Annotated, Any
 import pandas as pd
 import rich.progress
 import tyro
-from rich.console import Console
 from rich.table import Table
 
+from harness.archive import ArchiveError
 from harness.cost import IMPLEMENTATIONS, CostError, measure_in_turn
-from harness.estimate import Cost, EstimateError, measure
+from harness.estimate import EstimateError, measure
+from harness.extension import refuse_extension
 from harness.launchers.groups import make_groups
 from harness.launchers.local import Outcome, cores, run_local
-from harness.progress import Progress, duration
+from harness.pack import pack
+from harness.progress import Progress
 from harness.report.cost import measured_in_turn
-from harness.report.page import write_report
-from harness.report.results import TIMED, Results, load_results
+from harness.report.results import TIMED, load_results
 from harness.schema import SuiteError, Unseen, check_known, suite_names
-from harness.statistics import estimate_success, success_matrix
+from harness.show import (
+    console,
+    evaluation_tables,
+    make_report,
+    say,
+    show_costs,
+    show_others,
+)
 from harness.store import STATES, EvaluationError, Store, StoreError
 from harness.suite import load_suite
 
 app = tyro.extras.SubcommandApp()
-console = Console()
-say = functools.partial(console.print, highlight=False, soft_wrap=True)
 DEFAULT_SUITE = "smoke"
+RESULTS = Path("results")
+ARCHIVES = Path("docs/results")
+ERRORS = (  # what a person can mend, each with a sentence that says how
+    SuiteError,
+    StoreError,
+    ArchiveError,
+    EvaluationError,
+    EstimateError,
+    CostError,
+)
 
 
 @app.command(name="run-all")
 def run_all(
     suite: str = DEFAULT_SUITE,
     jobs: int | None = None,
-    results_dir: Path = Path("results"),
+    results_dir: Path = RESULTS,
+    archives: Path = ARCHIVES,
     total_timesteps: int | None = None,
+    extend: bool = False,
     seeds: int | None = None,
     agents: int | None = None,
     env: tuple[str, ...] = (),
@@ -58,7 +74,10 @@ def run_all(
         suite: Name of a suite (see `list`), or path of a TOML file.
         jobs: Runs at a time, one core each; by default all cores.
         results_dir: Where the runs' folders and the reports go.
+        archives: Where archives of finished runs are: what they hold is not run again.
         total_timesteps: Environment steps of each run, instead of the suite's.
+        extend: Continue finished runs to --total-timesteps, as if they had had them from the start.
+            The shorter runs' scores and evaluations are kept.
         seeds: So many seeds: the suite's first, then those that follow its last.
         agents: Only so many agents for each seed.
         env: Only these tasks, such as Hopper.
@@ -70,11 +89,17 @@ def run_all(
     jobs = cores() if jobs is None else jobs
     if jobs < 1:
         raise SuiteError(f"jobs must be at least 1, got {jobs}")
-    store = Store(results_dir)
+    if extend and total_timesteps is None:
+        raise SuiteError("--extend needs --total-timesteps: the length to continue the runs to")
+    store = Store(results_dir, archives)
     plan = load_suite(suite, total_timesteps=total_timesteps, seeds=seeds, agents=agents, env=env)
     for spec in plan.runs:
-        store.refuse_changed(spec)
-    todo = [spec for spec in plan.runs if store.state(spec) != "done"]
+        if extend:
+            refuse_extension(spec, store)
+        else:
+            store.refuse_changed(spec)
+    todo = [spec for spec in plan.runs if not store.is_done(spec)]
+    groups = make_groups(todo, store, jobs, plain)
     done = len(plan.runs) - len(todo)
     say(
         f"[bold]{plan.name}[/]: {plan.title}. {len(plan.runs)} runs, {plan.timesteps:,} steps; "
@@ -82,12 +107,13 @@ def run_all(
     )
     if dry_run:
         if todo:
-            show_costs(measure(make_groups(todo, store, jobs, plain), jobs, console), jobs)
+            show_costs(measure(groups, jobs, console), jobs)
         return
     outcome = Outcome()
     if todo:
-        with Progress(console, store, todo) as progress:
-            outcome = run_local(make_groups(todo, store, jobs, plain), store, jobs, progress)
+        members = [spec for group in groups for spec in group]  # those that share a run's process
+        with Progress(console, store, members) as progress:
+            outcome = run_local(groups, store, jobs, progress)
     own = load_suite(suite, total_timesteps=total_timesteps)
     runs = {run.run_id: run for run in [*own.runs, *plan.runs]}  # seeds beyond the suite's too
     whole = load_results(dataclasses.replace(own, runs=list(runs.values())), store)
@@ -113,24 +139,32 @@ def list_suites() -> None:
 
 
 @app.command(name="status")
-def status(suite: tuple[str, ...] = (), results_dir: Path = Path("results")) -> None:
+def status(
+    suite: tuple[str, ...] = (), results_dir: Path = RESULTS, archives: Path = ARCHIVES
+) -> None:
     """Tell how far each suite is: runs done, running, failed, interrupted and pending.
 
-    "changed" counts runs whose folder holds another configuration than the suite's.
+    "diverged" counts runs that ended since their own numbers became non-finite, which is an
+    outcome, and "changed" those whose folder holds another configuration than the suite's.
 
     Args:
         suite: Names of suites; by default all.
         results_dir: Where the runs' folders are.
+        archives: Where archives of finished runs are.
     """
-    store = Store(results_dir)
-    table = Table("suite", *STATES, "steps")
+    store = Store(results_dir, archives)
+    rows: dict[str, tuple[Counter[str], str]] = {}
     for name in suite or suite_names():
         plan = load_suite(name)
         states = {run.run_id: store.state(run) for run in plan.runs}
         steps = sum(store.steps(run) for run in plan.runs if states[run.run_id] != "changed")
-        counts = Counter(states.values())
-        numbers = [str(counts[state]) for state in STATES]
-        table.add_row(plan.name, *numbers, f"{steps:,} of {plan.timesteps:,}")
+        rows[plan.name] = Counter(states.values()), f"{steps:,} of {plan.timesteps:,}"
+
+    always = {"done", "pending"}
+    shown = [x for x in STATES if x in always or any(counts[x] for counts, _ in rows.values())]
+    table = Table("suite", *shown, "steps")
+    for name, (counts, done) in rows.items():
+        table.add_row(name, *[str(counts[state]) for state in shown], done)
     console.print(table)
 
 
@@ -188,40 +222,57 @@ def evaluate(
         console.print(table)
 
 
-def evaluation_tables(found: dict[str, pd.DataFrame]) -> list[Table]:
-    """What evaluations found, by run: a table of control agents, and one of CoinRun's."""
-    control = Table("run", "actions", "episodes", "return", "length", "|change|", "Sm")
-    levels = Table("run", "levels", "actions", "success rate", "95% interval over levels")
-    for run, episodes in found.items():
-        if "split" in episodes:
-            for (split, policy), part in episodes.groupby(["split", "policy"]):
-                rate = estimate_success([success_matrix(part)])
-                interval = f"{100 * rate.low:.1f} to {100 * rate.high:.1f}"
-                levels.add_row(run, split, policy, f"{100 * rate.mean:.1f}%", interval)
-            continue
-        for policy, part in episodes.groupby("policy"):
-            mean = part.mean(numeric_only=True)
-            spread = part["return"].std(ddof=0)
-            control.add_row(
-                run, policy, str(len(part)), f"{mean['return']:.1f} ± {spread:.1f}",
-                f"{mean['length']:.0f}", f"{mean['action_change']:.3f}",
-                f"{mean['smoothness']:.2e}",
-            )  # fmt: skip
-    return [table for table in (control, levels) if table.row_count]
+@app.command(name="archive")
+def archive(
+    suite: Annotated[str, tyro.conf.Positional],
+    results_dir: Path = RESULTS,
+    archives: Path = ARCHIVES,
+    total_timesteps: int | None = None,
+    seeds: int | None = None,
+    agents: int | None = None,
+    env: tuple[str, ...] = (),
+    with_checkpoints: bool = False,
+) -> None:
+    """Write a suite's finished runs to compact files, which `run-all` and `report` read.
+
+    A file holds the runs of one algorithm on one task, and is written once, when all are finished:
+    exact scores, curves of at most 100 points, evaluations, and what the runs were made with. Runs
+    that are finished later, such as those of more seeds, go to a file of their own.
+
+    Args:
+        suite: Name of a suite (see `list`), or path of a TOML file.
+        results_dir: Where the runs' folders are.
+        archives: Where the files go, in a folder for each suite.
+        total_timesteps: Environment steps of each run, as in `run-all`.
+        seeds: So many seeds, as in `run-all`.
+        agents: Only so many agents for each seed.
+        env: Only these tasks, such as Hopper.
+        with_checkpoints: Write the final checkpoints too, to a ZIP file beside each.
+    """
+    plan = load_suite(suite, total_timesteps=total_timesteps, seeds=seeds, agents=agents, env=env)
+    for packed in pack(plan, Store(results_dir, archives), archives, with_checkpoints):
+        say(packed.text, markup=False)
 
 
 @app.command(name="report")
 def report(
-    suite: str = DEFAULT_SUITE, results_dir: Path = Path("results"), seeds: int | None = None
+    suite: str = DEFAULT_SUITE,
+    results_dir: Path = RESULTS,
+    archives: Path = ARCHIVES,
+    total_timesteps: int | None = None,
+    seeds: int | None = None,
 ) -> None:
     """Report what a suite's runs show so far, beside the paper's tables.
 
     Args:
         suite: Name of a suite (see `list`), or path of a TOML file.
         results_dir: Where the runs' folders are and the report goes.
+        archives: Where archives of finished runs are.
+        total_timesteps: The runs of so many steps each, as in `run-all`.
         seeds: So many seeds, as in `run-all`: the suite's first, then those that follow its last.
     """
-    plan, store = load_suite(suite, seeds=seeds), Store(results_dir)
+    store = Store(results_dir, archives)
+    plan = load_suite(suite, total_timesteps=total_timesteps, seeds=seeds)
     make_report(load_results(plan, store), store)
 
 
@@ -248,6 +299,7 @@ def cost(
     ids = {run.environment: run.args["env_id"] for run in plan.runs}
     check_known(dict.fromkeys(implementation), set(IMPLEMENTATIONS), "implementation")
     timed = measure_in_turn(ids, list(implementation), repetitions, updates, say)
+
     results_dir.mkdir(parents=True, exist_ok=True)
     timed.to_csv(results_dir / TIMED, index=False)
     for finding in measured_in_turn(timed):
@@ -258,56 +310,6 @@ def cost(
         )
 
 
-def make_report(results: Results, store: Store) -> None:
-    """Print the table and the verdicts, and write the whole report to results/<suite>/report/."""
-    folder = store.report_path(results.suite.name)
-    sections, found = write_report(results, folder)
-    for section in sections:
-        console.print(section.table)
-        for note in section.notes:
-            say(f"• {note}", markup=False)
-    for claim in found:
-        say(f"Claim ({claim.letter}): {claim.statement} [bold]{claim.verdict}[/]")
-    say(f"Written: {folder / 'report.html'}, with its tables and figures beside it.")
-
-
-def show_others(results: Results) -> None:
-    """What the other suites would take here, at the speed that this one's runs have shown."""
-    speed = {
-        (run.baseline, run.environment): results.metrics[run.run_id]["charts/SPS"].iloc[-1]
-        for run in results.suite.runs
-        if run.run_id in results.metrics and "levels" not in run.evaluation  # too short to tell
-    }
-    for name in suite_names():
-        if name == results.suite.name:
-            continue
-        other = load_suite(name)
-        seconds = sum(
-            r.args["total_timesteps"] / speed.get((r.baseline, r.environment), math.nan)
-            for r in other.runs
-        )
-        cost = " (--dry-run says how long)" if math.isnan(seconds) else (
-            f", about {seconds / 3600:,.0f} core-hours, {duration(seconds / cores())} here"
-        )  # fmt: skip
-        what = f"{len(other.runs)} runs, {other.timesteps:,} steps"
-        say(f"To come: run-all --suite {name} takes {what}{cost}.")
-
-
-def show_costs(costs: list[Cost], jobs: int) -> None:
-    """What is to be run, by algorithm and task, and the sum."""
-    table = Table("algorithm", "task", "runs", "steps", "steps/s", "hours", "MB")
-    for c in costs:
-        table.add_row(c.algorithm, c.environment, str(c.runs), f"{c.steps:,}", f"{c.speed:,.0f}",
-                      f"{c.hours:,.1f}", f"{c.bytes / 1e6:,.0f}")  # fmt: skip
-    console.print(table)
-    hours = sum(c.hours for c in costs)
-    say(
-        f"{sum(c.runs for c in costs)} runs, {sum(c.steps for c in costs):,} steps: "
-        f"{hours:,.1f} hours of one process, {duration(3600 * hours / jobs)} with {jobs} at a "
-        f"time, {sum(c.bytes for c in costs) / 1e9:.2f} GB. Evaluations come on top."
-    )
-
-
 def main() -> None:
     for stop in (signal.SIGTERM, signal.SIGINT):  # a background job may begin with SIGINT ignored
         signal.signal(stop, signal.default_int_handler)
@@ -315,7 +317,7 @@ def main() -> None:
         signal.signal(signal.SIGHUP, signal.default_int_handler)
     try:
         app.cli(prog="python -m harness", description=__doc__)
-    except (SuiteError, StoreError, EvaluationError, EstimateError, CostError) as error:
+    except ERRORS as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         say("\nInterrupted: the same command continues from the runs' last checkpoints.")

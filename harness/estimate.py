@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import tempfile
 from pathlib import Path
 
 from rich.console import Console
 
+from harness.identity import make_args
 from harness.launchers.groups import Group
 from harness.launchers.local import run_local
 from harness.progress import Progress
@@ -57,18 +57,13 @@ def measure(groups: list[Group], jobs: int, console: Console) -> list[Cost]:
 
 
 def _updates(run: RunSpec) -> int:
-    return int(_settings(run).num_updates)
-
-
-def _settings(run: RunSpec):
-    """The baseline's own Args."""
-    args = {k: tuple(v) if isinstance(v, list) else v for k, v in run.args.items()}
-    return importlib.import_module(f"baselines.{run.baseline}").Args(**args)
+    return int(make_args(run.baseline, run.args).num_updates)
 
 
 def _shortened(run: RunSpec) -> RunSpec:
-    steps = min(UPDATES * _settings(run).batch_size, run.args["total_timesteps"])
-    return dataclasses.replace(run, args={**run.args, "total_timesteps": steps}, evaluation={})
+    two = UPDATES * make_args(run.baseline, run.args).batch_size
+    short = run.with_args(total_timesteps=min(two, run.args["total_timesteps"]))
+    return dataclasses.replace(short, evaluation={})
 
 
 def _cost(kind: tuple[str, str], groups: list[Group], sample: RunSpec, store: Store) -> Cost:

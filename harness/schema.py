@@ -12,6 +12,8 @@ from typing import Any, Literal
 
 import gymnasium as gym
 
+from harness.identity import make_args
+
 SUITES = Path(__file__).parent / "suites"
 RUNS = {"seeds", "agents", "args", "algorithms", "environments"}
 KEYS = RUNS | {"title", "note", "figures", "sweeps", "evaluation", "include"}
@@ -96,7 +98,7 @@ def check_args(baseline: str, args: dict[str, Any], evaluation: dict[str, Any], 
         if not fits(value, hints[name]):
             raise SuiteError(f"{where}: {name} must be {hints[name]}, got {value!r}")
     try:
-        made = cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in args.items()})
+        made = make_args(baseline, args)
         if not has_games:
             registers, _, name = args["env_id"].rpartition(":")
             importlib.import_module(registers or "pybullet_envs_gymnasium")

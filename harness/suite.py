@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import re
@@ -10,6 +11,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from harness.identity import identify, resolve
 from harness.schema import SuiteError, check_args, check_keys, check_known, fits, read
 
 ALGORITHM_KEYS = {"name", "baseline", "args", "environments"}
@@ -35,15 +37,28 @@ class RunSpec:
 
     @property
     def run_id(self) -> str:
-        algorithm = re.sub(r"\W+", "-", self.algorithm.lower())
-        return f"{algorithm}__{self.environment}__s{self.args['seed']}__a{self.args['agent']}"
+        seed, agent = self.args["seed"], self.args["agent"]
+        return f"{slug(self.algorithm)}__{self.environment}__s{seed}__a{agent}"
+
+    @property
+    def resolved(self) -> dict[str, Any]:
+        """All arguments, the baseline's defaults included."""
+        return resolve(self.baseline, self.args)
+
+    @functools.cached_property
+    def identity(self) -> dict[str, Any]:
+        """All that decides the run's numbers: see harness.identity."""
+        return identify(self.baseline, self.args, self.evaluation)
 
     @property
     def hash(self) -> str:
-        """Tells a changed configuration from a finished one."""
-        settings = [self.baseline, self.args, *([self.evaluation] if self.evaluation else [])]
-        content = json.dumps(settings, sort_keys=True)
+        """Of the identity, so that runs of the same settings are found among many."""
+        content = json.dumps(self.identity, sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()
+
+    def with_args(self, **changes: Any) -> RunSpec:
+        """The same run with other arguments."""
+        return dataclasses.replace(self, args={**self.args, **changes})
 
     @property
     def flags(self) -> list[str]:
@@ -57,6 +72,11 @@ class RunSpec:
                 values = value if isinstance(value, list) else [value]
                 flags += [f"--{flag}", *map(str, values)]
         return flags
+
+
+def slug(name: str) -> str:
+    """An algorithm's name as part of a file's name."""
+    return re.sub(r"\W+", "-", name.lower())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,14 +132,18 @@ def load_suite(
     for other, its in included:
         if "include" in its:
             raise SuiteError(f"{path.name} includes {other.stem}, which includes others: name them")
+
     files = [(p, d) for p, d in [(path, data), *included] if "algorithms" in d]
-    there = {environment for _, d in files for environment in d["environments"]}
-    check_known(dict.fromkeys(env), there, "environment")
+    known = {environment for _, d in files for environment in d["environments"]}
+    check_known(dict.fromkeys(env), known, "environment")
+
     parts = [_own_runs(p, _scaled(d, total_timesteps, seeds, agents, env)) for p, d in files]
     found: dict[tuple[str, ...], RunSpec] = {}
-    for run in (run for part in parts for run in part.runs):
-        found.setdefault((run.algorithm, run.environment, run.hash), run)
-    runs = list(found.values())  # what several suites have is run once, by the first of them
+    for part in parts:
+        for run in part.runs:  # what several suites have is run once, by the first of them
+            found.setdefault((run.algorithm, run.environment, run.hash), run)
+
+    runs = list(found.values())
     if not runs:
         raise SuiteError(f"{path.name} has no runs: it needs algorithms, environments and seeds")
     if len({run.run_id for run in runs}) < len(runs):
@@ -143,14 +167,26 @@ def _scaled(
     agents: int | None,
     env: tuple[str, ...],
 ) -> dict[str, Any]:
-    more = range(max(data["seeds"]) + 1, max(data["seeds"]) + 1 + (seeds or 0))
-    steps = {"total_timesteps": total_timesteps} if total_timesteps else {}
+    """The suite's data with what the command line asks for instead."""
+    own_seeds = data["seeds"]
+    if seeds is not None:
+        first = max(own_seeds) + 1  # of those that follow the suite's own
+        own_seeds = [*own_seeds, *range(first, first + seeds)][:seeds]
+
+    args = data["args"]
+    if total_timesteps is not None:
+        args = {**args, "total_timesteps": total_timesteps}
+
+    environments = data["environments"]
+    if env:
+        environments = {name: x for name, x in environments.items() if name in env}
+
     return {
         **data,
-        "seeds": [*data["seeds"], *more][:seeds] if seeds else data["seeds"],
-        "agents": agents or data["agents"],
-        "args": {**data["args"], **steps},
-        "environments": {k: v for k, v in data["environments"].items() if k in env or not env},
+        "seeds": own_seeds,
+        "agents": data["agents"] if agents is None else agents,
+        "args": args,
+        "environments": environments,
         "all_environments": set(data["environments"]),
     }
 

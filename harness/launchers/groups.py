@@ -11,36 +11,56 @@ from harness.store import Store
 from harness.suite import RunSpec
 
 Group = list[RunSpec]
-"""agents numbered in a row, of one algorithm, environment and seed; or a single run"""
+"""agents of one algorithm, environment and seed, numbered in a row; or a single run"""
 
 
 def make_groups(specs: list[RunSpec], store: Store, jobs: int, plain: bool = False) -> list[Group]:
     """Runs together, as large as leaves none of `jobs` idle; each alone if `plain` or compiled.
 
-    Runs that were interrupted stay with those they were begun with: these are as far as they are.
+    Agents that were begun together are continued together, whether `specs` names them all or not
+    and whatever `plain` says: apart they would end with other numbers.
     """
-    together: dict[tuple, list[RunSpec]] = {}
-    for spec in specs:
-        compiled = spec.args.get("compile", False)
-        alone = plain or compiled or not has_population(spec.baseline)
-        settings = tuple((k, str(v)) for k, v in spec.args.items() if k != "agent")
-        partners = tuple(store.partners(spec))
-        key = (spec.run_id,) if alone else (spec.algorithm, spec.environment, settings, partners)
-        together.setdefault(key, []).append(spec)
-    most = max(1, len(specs) // jobs)
-    groups = []
-    for key, found in together.items():
-        begun = len(key) > 1 and key[-1]
-        for row in _rows(sorted(found, key=lambda spec: spec.args["agent"])):
-            size = len(row) if begun else most
-            groups += [row[i : i + size] for i in range(0, len(row), size)]
+    largest = max(1, len(specs) // jobs)
+    groups: list[Group] = []
+    for alike in _differing_in_agent(specs):
+        begun = _begun_together(alike, store)
+        groups += begun
+
+        members = {spec.run_id for group in begun for spec in group}
+        fresh = [spec for spec in alike if spec.run_id not in members]
+        size = 1 if plain or _is_alone(alike[0]) else largest
+        groups += _chunks(fresh, size)
     return groups
 
 
-def _rows(specs: list[RunSpec]) -> list[list[RunSpec]]:
-    """Split where a number is missing."""
+def _differing_in_agent(specs: list[RunSpec]) -> list[list[RunSpec]]:
+    """The runs, those together that differ in nothing but the agent's number, in its order."""
+    alike: dict[tuple[str, ...], list[RunSpec]] = {}
+    for spec in specs:
+        settings = [f"{name}={value}" for name, value in spec.args.items() if name != "agent"]
+        alike.setdefault((spec.algorithm, spec.environment, *settings), []).append(spec)
+    return [sorted(found, key=lambda spec: spec.args["agent"]) for found in alike.values()]
+
+
+def _begun_together(alike: list[RunSpec], store: Store) -> list[Group]:
+    """The groups, all members each, that some of these runs were begun in.
+
+    A kill while a group begins may leave members that do not know of it yet: the first ones do.
+    """
+    groups = {tuple(store.members(spec)) for spec in alike}
+    return [[alike[0].with_args(agent=i) for i in agents] for agents in sorted(groups) if agents]
+
+
+def _is_alone(spec: RunSpec) -> bool:
+    """Whether no population can train it."""
+    return spec.args.get("compile", False) or not has_population(spec.baseline)
+
+
+def _chunks(specs: list[RunSpec], size: int) -> list[Group]:
+    """At most `size` runs each, split also where a number is missing."""
     numbered = groupby(enumerate(specs), key=lambda pair: pair[1].args["agent"] - pair[0])
-    return [[spec for _, spec in row] for _, row in numbered]
+    rows = [[spec for _, spec in row] for _, row in numbered]
+    return [row[i : i + size] for row in rows for i in range(0, len(row), size)]
 
 
 @functools.cache
@@ -57,6 +77,8 @@ def commands(group: Group, store: Store) -> list[list[str]]:
         baseline += "_population"
         path = path.removesuffix(str(first.args["agent"])) + "{agent}"
         more = ["--num-agents", str(len(group))]
+    if any(store.was_extended(spec) for spec in group):
+        more.append("--extend")
     train = [f"baselines.{baseline}", *first.flags, *more, "--run-dir", path, "--resume"]
     made = [[sys.executable, "-m", *train]]
     if first.evaluation:

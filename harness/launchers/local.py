@@ -10,14 +10,13 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from harness.launchers.groups import Group, commands
 from harness.progress import Progress
+from harness.provenance import ROOT, cores
 from harness.store import Store
 from harness.suite import RunSpec
 
-ROOT = Path(__file__).parents[2]  # the checkout
 GRACE = 15.0  # seconds that a run has to end itself
 
 
@@ -26,6 +25,7 @@ class Outcome:
     """What became of the runs that were started, and of those that were not."""
 
     done: list[RunSpec] = field(default_factory=list)
+    """those that diverged too: that is an outcome"""
     failed: list[RunSpec] = field(default_factory=list)
     held: list[RunSpec] = field(default_factory=list)
     """locked by another process, which runs them"""
@@ -51,57 +51,72 @@ class _Child:
         return False
 
 
-def cores() -> int:
-    """Cores that this process may use."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
-
-
 def run_local(groups: list[Group], store: Store, jobs: int, progress: Progress) -> Outcome:
     """Run the groups, `jobs` at a time; whatever ends this early stops the children first.
 
     A child that is stopped keeps its last checkpoint, and goes on from it when it is run again.
     """
-    waiting, children, outcome = deque(groups), [], Outcome()
+    waiting, outcome = deque(groups), Outcome()
+    children: list[_Child] = []
     with _stopping(children):
         while waiting or children:
             while waiting and len(children) < jobs:
                 group = waiting.popleft()
-                child = _start(group, store, max(1, cores() // jobs))
-                if child is not None:
+                if child := _start(group, store, max(1, cores() // jobs)):
                     children.append(child)
-                    continue
-                if len(group) > 1:  # some are another launcher's: see each for itself
+                elif len(group) > 1 and not _is_begun(group, store):
+                    # Some are another launcher's, so see each for itself.
                     waiting.extendleft([spec] for spec in reversed(group))
-                    continue
-                for spec in group:
-                    done = store.is_done(spec)
-                    (outcome.done if done else outcome.held).append(spec)
-                    how = "done by" if done else "being run by"
-                    progress.ended(spec, f"{how} another process")
+                else:
+                    _leave(group, store, outcome, progress)
+
             for child in [c for c in children if c.ended()]:
                 children.remove(child)
-                seconds = time.monotonic() - child.started
-                good = child.process.returncode == 0
-                for spec in child.group:
-                    store.finish(spec, child.process.returncode, seconds / len(child.group))
-                    (outcome.done if good else outcome.failed).append(spec)
-                child.resources.close()
-                for spec in child.group:
-                    progress.ended(spec, f"{'done' if good else 'FAILED'} in {seconds:.0f} s")
+                _finish(child, store, outcome, progress)
+
             progress.update([spec for child in children for spec in child.group])
             time.sleep(0.1)
     return outcome
 
 
+def _leave(group: Group, store: Store, outcome: Outcome, progress: Progress) -> None:
+    """Account for runs that another process has, or that must not be started."""
+    for spec in group:
+        done = store.is_done(spec)
+        (outcome.done if done else outcome.held).append(spec)
+        how = "done by" if done else "being run by"
+        progress.ended(spec, f"{how} another process")
+
+
+def _finish(child: _Child, store: Store, outcome: Outcome, progress: Progress) -> None:
+    """Mark the runs of a child that has ended, and say so."""
+    seconds = time.monotonic() - child.started
+    states = {}
+    for spec in child.group:
+        if store.is_done(spec):  # before the others of its group, which a kill left behind
+            states[spec.run_id] = store.state(spec)
+        else:
+            returncode = child.process.returncode
+            states[spec.run_id] = store.finish(spec, returncode, seconds / len(child.group))
+
+    child.resources.close()
+    for spec in child.group:
+        state = states[spec.run_id]
+        (outcome.failed if state == "failed" else outcome.done).append(spec)
+        progress.ended(spec, f"{state.replace('failed', 'FAILED')} in {seconds:.0f} s")
+
+
 def _start(group: Group, store: Store, threads: int) -> _Child | None:
+    """Begin to train a group, or to continue it; None where another process has a part in it."""
     with contextlib.ExitStack() as stack:
         locks = [stack.enter_context(store.lock(spec)) for spec in group]
-        if None in locks or any(map(store.is_done, group)):  # by another launcher since the plan
+        if None in locks or not _may_start(group, store):
             return None
+
         first, *then = commands(group, store)
         for spec in group:
             store.start(spec, first, group)
+
         log = stack.enter_context(open(store.path(group[0], "log.txt"), "ab"))
         start = functools.partial(
             subprocess.Popen[bytes],
@@ -114,6 +129,24 @@ def _start(group: Group, store: Store, threads: int) -> _Child | None:
             pass_fds=locks,
         )
         return _Child(group, start(first), then, start, stack.pop_all(), time.monotonic())
+
+
+def _is_begun(group: Group, store: Store) -> bool:
+    """Whether it was begun as this very group."""
+    agents = [spec.args["agent"] for spec in group]
+    return any(store.members(spec) == agents for spec in group)
+
+
+def _may_start(group: Group, store: Store) -> bool:
+    """Whether the group is still as it was when it was planned: another launcher may have come."""
+    agents = [spec.args["agent"] for spec in group]
+    if any(store.members(spec) not in ([], agents) for spec in group):
+        return False  # begun with others since
+    if any(set(store.changes(spec)) - {"total_timesteps"} for spec in group):
+        return False  # begun with other settings since
+
+    done = [store.is_done(spec) for spec in group]
+    return not all(done) if _is_begun(group, store) else not any(done)
 
 
 @contextlib.contextmanager

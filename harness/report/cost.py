@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
+from harness.provenance import last_session, machine_of
 from harness.report.claims.finding import (
     CONTRADICTED,
     SUPPORTED,
@@ -101,15 +102,15 @@ def step_times(results: Results) -> pd.DataFrame:
         if run.algorithm not in arms or run.run_id not in results.done:
             continue
         plain, arm = arms[run.algorithm]
-        spec = results.specs.get(run.run_id, {})
-        speed = float(results.metrics[run.run_id]["charts/SPS"].iloc[-1])
+        session = last_session(results.specs.get(run.run_id, {}))
+        speed = results.scores[run.run_id]["final/charts/SPS"]
         rows.append(
             {
                 "kind": "CoinRun" if "levels" in run.evaluation else "control",
                 "plain": plain,
                 "arm": arm,
-                "implementation": str(spec.get("implementation", UNKNOWN)),
-                "machine": str(spec.get("machine", UNKNOWN)),
+                "implementation": session["implementation"] if session else UNKNOWN,
+                "machine": machine_of(session) if session else UNKNOWN,
                 "environment": run.environment,
                 "seed": run.args["seed"],
                 "seconds": 1 / speed,

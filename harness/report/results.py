@@ -8,7 +8,10 @@ from typing import Any
 
 import pandas as pd
 
-from harness.store import Store, read_json
+from harness.provenance import Origins, find_origins
+from harness.record import Record, thin
+from harness.scores import exact_scores
+from harness.store import Store
 from harness.suite import Suite
 
 TIMED = "cost.csv"  # in the results' folder
@@ -16,25 +19,34 @@ TIMED = "cost.csv"  # in the results' folder
 
 @dataclasses.dataclass(frozen=True)
 class Results:
-    """The metrics of each run that has any, by run id."""
+    """What each run that has any metrics has left, by run id."""
 
     suite: Suite
     metrics: dict[str, pd.DataFrame]
+    """rows for drawing: all updates, or means over blocks of them"""
     changed: list[str]
     """ids of runs that were made by another configuration: left out"""
     done: list[str]
-    """ids of runs that are complete"""
+    """ids of runs that are complete, those that diverged too"""
     evaluations: dict[str, pd.DataFrame]
     """episodes of the final policy, by run id, of the runs that were evaluated: on seen and unseen
     levels, or on a control task"""
     folders: dict[str, Path]
-    """where each run's files are, by run id"""
+    """where each run's files are, or would be, by run id"""
     diverged: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
-    """what became non-finite, and when, by run id: an outcome, no missing run"""
+    """update, what and message of the runs that diverged, by run id"""
     specs: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
-    """what each run says of itself: its implementation and its machine among it"""
+    """content of each run's spec.json, by run id"""
+    scores: dict[str, dict[str, float]] = dataclasses.field(default_factory=dict)
+    """exact numbers from every row, as `harness.scores` names them; also of runs under way"""
     timed: pd.DataFrame | None = None
     """what `python -m harness cost` has measured, if it has"""
+
+    @property
+    def origins(self) -> Origins:
+        """The code, versions and machines behind the runs of this part of the suite."""
+        runs = [run.run_id for run in self.suite.runs]
+        return find_origins(self.specs[run_id] for run_id in runs if run_id in self.specs)
 
     def part(self, evaluated: bool) -> Results:
         """The runs that are evaluated on levels, or the others: the control tasks."""
@@ -82,27 +94,58 @@ class Results:
 
 
 def load_results(suite: Suite, store: Store) -> Results:
-    """Read what there is; runs may be unfinished, or still be running."""
-    metrics = {}
-    evaluations = {}
-    diverged = {}
-    specs = {}
+    """Read what there is, here and in archives; runs may be unfinished, or still be running.
+
+    Raises:
+        ArchiveError: An archive is damaged, or holds another outcome of a run than another place.
+    """
+    records = {run.run_id: record for run in suite.runs if (record := store.record(run))}
+    metrics = {run_id: record.curves for run_id, record in records.items() if len(record.curves)}
+    scores = {run_id: records[run_id].scores for run_id in metrics}
+    specs = {run_id: record.spec for run_id, record in records.items()}
     changed = []
-    done = []
     for run in suite.runs:
-        if store.changes(run):
+        if run.run_id in records:
+            continue
+        if store.changes(run) or store.archives.others(run):
             changed.append(run.run_id)
-            continue
-        specs[run.run_id] = read_json(store.path(run, "spec.json")) or {}
-        if (failure := read_json(store.path(run, "diverged.json"))) is not None:
-            diverged[run.run_id] = failure
-        if (found := store.metrics(run)) is None:
-            continue
-        metrics[run.run_id] = found
-        if store.is_done(run):
-            done.append(run.run_id)
-            if (path := store.path(run, "evaluation.csv")).exists():
-                evaluations[run.run_id] = pd.read_csv(path)
-    folders = {run.run_id: store.path(run) for run in suite.runs}
-    timed = pd.read_csv(path) if (path := store.root / TIMED).exists() else None
-    return Results(suite, metrics, changed, done, evaluations, folders, diverged, specs, timed)
+        elif (found := store.metrics(run)) is not None:
+            metrics[run.run_id] = found
+            scores[run.run_id] = exact_scores(found, run.args["total_timesteps"])
+            specs[run.run_id] = store.saved(run) or {}
+
+    diverged = {k: x.done["diverged"] for k, x in records.items() if x.state == "diverged"}
+    evaluations = {k: r.evaluation for k, r in records.items() if r.evaluation is not None}
+    timed = store.root / TIMED
+    return Results(
+        suite=suite,
+        metrics=_alike(suite, metrics, records),
+        scores=scores,
+        changed=changed,
+        done=[run.run_id for run in suite.runs if run.run_id in records],
+        diverged=diverged,
+        evaluations=evaluations,
+        folders={run.run_id: store.path(run) for run in suite.runs},
+        specs=specs,
+        timed=pd.read_csv(timed) if timed.exists() else None,
+    )
+
+
+def _alike(
+    suite: Suite, metrics: dict[str, pd.DataFrame], records: dict[str, Record]
+) -> dict[str, pd.DataFrame]:
+    """The metrics, thinned where another run of the same task and algorithm comes thinned."""
+    blocks: dict[tuple[str, str], int] = {}
+    for run in suite.runs:
+        if run.run_id in records:
+            key = (run.environment, run.algorithm)
+            blocks[key] = max(blocks.get(key, 1), records[run.run_id].updates)
+
+    found = {}
+    for run in suite.runs:
+        if run.run_id in metrics:
+            own = records[run.run_id].updates if run.run_id in records else 1
+            block = blocks.get((run.environment, run.algorithm), 1)
+            rows = metrics[run.run_id]
+            found[run.run_id] = thin(rows, block) if own == 1 else rows
+    return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pandas as pd
 import pytest
 
 from baselines import ppo_reg_coinrun
+from harness import cli
 from harness.evaluation.control import COLUMNS
 from harness.store import Store, write_json
 from harness.suite import RunSpec, Suite, load_suite
@@ -40,6 +42,31 @@ baseline = "ppo_reg"
 Hopper = "Pendulum-v1"
 Reacher = "MountainCarContinuous-v0"
 """
+
+
+@pytest.fixture
+def run_cli(monkeypatch, capsys, tmp_path):
+    """Run a command in this process, away from the checkout's results and archives.
+
+    Gives its exit status and output.
+    """
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words: object) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["harness", *map(str, words)])
+        monkeypatch.setattr(cli.console, "width", 200)
+        status = 0
+        try:
+            cli.main()
+        except SystemExit as stopped:
+            status = stopped.code if isinstance(stopped.code, int) else 1
+            message = "" if isinstance(stopped.code, int) else str(stopped.code)
+        else:
+            message = ""
+        captured = capsys.readouterr()
+        return status, captured.out + captured.err + message
+
+    return run
 
 
 @pytest.fixture

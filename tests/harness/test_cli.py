@@ -9,33 +9,12 @@ import sys
 import pandas as pd
 import pytest
 
-from harness import cli
 from harness.evaluation import runs
+from harness.files import write_json
 from harness.launchers.local import ROOT
 from harness.schema import suite_names
 from harness.suite import load_suite
 from tests.harness.conftest import make_episodes, write_run
-
-
-@pytest.fixture
-def run_cli(monkeypatch, capsys):
-    """Run a command in this process; gives its exit status and output."""
-
-    def run(*words: object) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["harness", *map(str, words)])
-        monkeypatch.setattr(cli.console, "width", 200)
-        status = 0
-        try:
-            cli.main()
-        except SystemExit as stopped:
-            status = stopped.code if isinstance(stopped.code, int) else 1
-            message = "" if isinstance(stopped.code, int) else str(stopped.code)
-        else:
-            message = ""
-        captured = capsys.readouterr()
-        return status, captured.out + captured.err + message
-
-    return run
 
 
 @pytest.fixture
@@ -84,24 +63,42 @@ def test_a_changed_configuration_is_refused_before_anything_starts(run_cli, stor
     assert not store.path(suite.runs[1]).exists()
 
 
+def columns(out: str, suite: str) -> dict[str, str]:
+    """A suite's row of what `status` prints, by column."""
+    lines = [x.replace("┃", " ").replace("│", " ").split() for x in out.splitlines()]
+    header = next(line for line in lines if line[:1] == ["suite"])
+    row = next(line for line in lines if line[:1] == [suite])
+    return dict(
+        zip(header, [*row[: len(header) - 1], " ".join(row[len(header) - 1 :])], strict=True)
+    )
+
+
 def test_status_counts_states(run_cli, store, suite, suite_file):
     write_run(store, suite.runs[0], [1.0, 2.0])
     store.start(suite.runs[1], ["true"], [suite.runs[1]])
     status, out = run_cli("status", "--suite", suite_file, "--results-dir", store.root)
-    row = next(line for line in out.splitlines() if "tiny" in line)
     assert status == 0
-    assert [int(x) for x in row.replace("│", " ").split()[1:7]] == [1, 0, 0, 1, 14, 0]
-    assert "200 of 3,200" in row
+    assert columns(out, "tiny") == {
+        "suite": "tiny", "done": "1", "interrupted": "1", "pending": "14", "steps": "200 of 3,200"
+    }  # fmt: skip
+
+
+def test_status_counts_runs_that_diverged(run_cli, store, suite, suite_file):
+    write_run(store, suite.runs[0], [1.0], done=False)
+    write_json(store.path(suite.runs[0], "diverged.json"), {"message": "NaN"})
+    store.finish(suite.runs[0], returncode=3, seconds=1.0)
+    _, out = run_cli("status", "--suite", suite_file, "--results-dir", store.root)
+    assert columns(out, "tiny")["diverged"] == "1"
+    assert columns(out, "tiny")["done"] == "0"
 
 
 def test_status_goes_on_where_the_settings_were_others(run_cli, store, suite):
-    changed = dataclasses.replace(suite.runs[0], suite="smoke", args=suite.runs[0].args | {"x": 1})
+    changed = dataclasses.replace(suite.runs[0], suite="smoke").with_args(gamma=0.5)
     write_run(store, changed, [1.0])
     status, out = run_cli("status", "--results-dir", store.root)
-    row = next(line for line in out.splitlines() if "smoke" in line)
     assert status == 0
-    assert row.replace("│", " ").split()[6] == "1"
-    assert "table1" in out
+    assert columns(out, "smoke")["changed"] == "1"
+    assert columns(out, "table1")["changed"] == "0"
 
 
 def test_a_part_of_a_suite_does_not_hide_the_rest_of_the_report(run_cli, store, suite, small):
@@ -250,7 +247,7 @@ def test_cost_says_what_was_added_and_keeps_it(run_cli, tmp_path, monkeypatch):
         }
     )  # fmt: skip
     asked = []
-    monkeypatch.setattr(cli, "measure_in_turn", lambda *given: asked.append(given) or timed)
+    monkeypatch.setattr("harness.cli.measure_in_turn", lambda *given: asked.append(given) or timed)
     status, out = run_cli("cost", "--env", "Hopper", "--results-dir", tmp_path / "new")
     assert status == 0
     assert "+5.0% [+5.0, +5.0], n 6: supported" in out

@@ -69,7 +69,7 @@ def test_another_configuration_is_not_taken_for_a_finished_run(store, suite):
     changed = dataclasses.replace(spec, args={**spec.args, "gamma": 0.9})
     assert store.state(changed) == "changed"
     store.refuse_changed(spec)
-    with pytest.raises(StoreError, match=r"gamma None -> 0\.9.*--results-dir"):
+    with pytest.raises(StoreError, match=r"gamma 0\.99 -> 0\.9.*--results-dir"):
         store.refuse_changed(changed)
 
 
@@ -96,9 +96,9 @@ def test_another_baseline_is_named(store, suite):
 def test_a_run_is_done_when_it_is_evaluated_too(store, suite):
     spec = dataclasses.replace(suite.runs[0], evaluation={"levels": 1, "repeats": 1})
     write_run(store, spec, [1.0], done=False)
-    with pytest.raises(FileNotFoundError, match=r"evaluation\.csv"):
-        store.finish(spec, returncode=0, seconds=1.0)
-    assert store.state(spec) == "interrupted"
+    assert store.finish(spec, returncode=0, seconds=1.0) == store.state(spec) == "failed"
+    failed = json.loads(store.path(spec, "failed.json").read_text())
+    assert failed == {"missing": ["evaluation.csv"]}
     write_run(store, spec, [1.0], episodes=make_episodes(seen_sampled=[[1.0]]))
     done = json.loads(store.path(spec, "done.json").read_text())
     content = store.path(spec, "evaluation.csv").read_bytes()

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from harness.report.results import Results
-from harness.statistics import early_psi, final_score, moved_together, training_psi, training_score
+from harness.statistics import final_score
 from harness.suite import RunSpec
 
 COLUMNS = {
@@ -35,12 +35,8 @@ def agent_table(results: Results) -> pd.DataFrame:
 
 
 def _row(run: RunSpec, results: Results) -> dict[str, Any]:
-    metrics = results.metrics.get(run.run_id)
-    if metrics is None:
-        columns = ["global_step", "charts/episodic_return", "conditioning/psi"]
-        metrics = pd.DataFrame(columns=columns, dtype=float)
+    scores = results.scores.get(run.run_id, {})
     failed = run.run_id in results.diverged
-    total = run.args["total_timesteps"]
     episodes = results.evaluations.get(run.run_id)
     played = episodes is not None and not failed and "episode" in episodes
 
@@ -52,14 +48,14 @@ def _row(run: RunSpec, results: Results) -> dict[str, Any]:
         "agent": run.args["agent"],
         "done": failed or run.run_id in results.done,
         "failed": failed,
-        "updates": len(metrics),
-        "steps": int(metrics["global_step"].max()) if len(metrics) else 0,
-        "reward": np.nan if failed else training_score(metrics, total),
+        "updates": scores.get("updates", 0),
+        "steps": scores.get("steps", 0),
+        "reward": np.nan if failed else scores.get("training_score", np.nan),
         "final": final_score(episodes) if played else np.nan,
         "final_sampled": final_score(episodes, "sampled") if played else np.nan,
-        "psi": training_psi(metrics, total),
-        "early_psi": early_psi(metrics, total),
-        "together": moved_together(metrics),
+        "psi": scores.get("psi", np.nan),
+        "early_psi": scores.get("early_psi", np.nan),
+        "together": scores.get("together", np.nan),
     }
 
 

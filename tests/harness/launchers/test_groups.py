@@ -58,6 +58,22 @@ def test_interrupted_agents_stay_with_those_they_were_begun_with(store):
     assert len(make_groups(runs[:2], store, jobs=8)) == 1  # even if cores stay idle
 
 
+def test_agents_begun_together_stay_so_whatever_is_asked_for(store):
+    """In a part of the plan and in `plain` too: apart they would end with other numbers."""
+    runs = [run for run in table1(seeds=1, agents=4) if run.algorithm == "PPO"]
+    for run in runs:
+        store.start(run, [], runs)
+    assert names(make_groups(runs[:1], store, jobs=8)) == names([runs])
+    assert names(make_groups(runs, store, jobs=1, plain=True)) == names([runs])
+
+
+def test_a_group_that_a_kill_left_half_begun_is_whole_again(store):
+    """The first members know of all; the last ones have not been told yet."""
+    runs = [run for run in table1(seeds=1, agents=4) if run.algorithm == "PPO"]
+    store.start(runs[0], [], runs[:3])
+    assert names(make_groups(runs, store, jobs=1)) == names([runs[:3], runs[3:]])
+
+
 def test_an_agent_that_was_begun_alone_is_not_joined_by_newcomers(store):
     runs = [run for run in table1(seeds=1, agents=3) if run.algorithm == "PPO"]
     store.start(runs[0], [], runs[:1])

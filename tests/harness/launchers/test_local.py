@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import io
 import json
@@ -134,6 +135,133 @@ def test_runs_whose_launcher_was_killed_are_not_started_twice(suite_file, tmp_pa
     assert [path.read_text().count("\n") for path in results.glob("tiny/*/metrics.csv")] == [
         201
     ] * 2
+
+
+# --- groups --------------------------------------------------------------------------------------
+
+TOUCH = """
+import pathlib, sys
+for folder in map(pathlib.Path, sys.argv[1:]):
+    for name in ("metrics.csv", "checkpoint.pt"):
+        (folder / name).write_text("made")
+"""
+"""a command that writes the files that have to be there, in each folder that it is given"""
+
+
+@pytest.fixture
+def trained(monkeypatch):
+    """The groups that were trained, by a command in place of the baseline's."""
+    seen = []
+
+    def made(group, store, code=TOUCH):
+        seen.append([spec.args["agent"] for spec in group])
+        paths = [str(store.path(spec).resolve()) for spec in group]
+        return [[sys.executable, "-c", code, *paths]]
+
+    monkeypatch.setattr(local, "commands", made)
+    return seen
+
+
+@pytest.fixture
+def agents(suite):
+    """Two agents that differ in nothing but their number."""
+    return suite.runs[:2]
+
+
+def run_group(group, store):
+    with Progress(Console(file=io.StringIO()), store, group) as progress:
+        return run_local([group], store, 2, progress)
+
+
+def test_a_group_is_trained_together_and_says_so(store, agents, trained):
+    assert run_group(agents, store).done == agents
+    assert trained == [[0, 1]]
+    for spec in agents:
+        saved = store.saved(spec)
+        assert saved["agents"] == saved["sessions"][0]["agents"] == [0, 1]
+        assert saved["sessions"][0]["implementation"] == "population"
+
+
+def test_members_that_a_kill_left_unmarked_are_marked_without_the_others(store, agents, trained):
+    first, second = agents
+    for spec in agents:
+        store.start(spec, [], agents)
+        for name in ("metrics.csv", "checkpoint.pt"):
+            store.path(spec, name).write_text("made")
+    store.finish(first, returncode=0, seconds=1.0)
+    before = store.path(first, "done.json").read_text()
+    outcome = run_group(agents, store)
+    assert trained == [[0, 1]]  # together: the program says that they are finished
+    assert outcome.done == agents
+    assert store.state(second) == "done"
+    assert store.path(first, "done.json").read_text() == before
+
+
+def test_of_a_new_group_what_another_launcher_has_is_left_to_it(store, agents, trained):
+    first, second = agents
+    with store.lock(first):
+        outcome = run_group(agents, store)
+    assert trained == [[1]]
+    assert (outcome.held, outcome.done) == ([first], [second])
+
+
+def test_a_begun_group_is_not_started_without_a_member(store, agents, trained):
+    for spec in agents:
+        store.start(spec, [], agents)
+    with store.lock(agents[0]):
+        outcome = run_group(agents, store)
+    assert trained == []
+    assert outcome.held == agents
+
+
+def test_a_run_that_was_begun_with_others_since_the_plan_is_left_alone(store, agents, trained):
+    for spec in agents:
+        store.start(spec, [], agents)
+    assert run([agents[0]], store).held == [agents[0]]
+    assert trained == []
+
+
+def test_another_launchers_finished_run_of_other_settings_stays(store, agents, trained):
+    write_run(store, agents[0].with_args(gamma=0.5), [1.0])
+    assert run([agents[0]], store).held == [agents[0]]
+    assert trained == []
+    assert store.saved(agents[0])["args"]["gamma"] == 0.5
+
+
+# --- runs that diverge ---------------------------------------------------------------------------
+
+DIVERGED = '{"update": 3, "what": "reward", "message": "a reward was NaN"}'
+DIVERGE = f"(folder / 'diverged.json').write_text({DIVERGED!r})"
+
+
+def test_a_run_that_diverges_is_an_outcome_not_a_failure(store, evaluated, scripts):
+    scripts(say("train", f"{DIVERGE}; sys.exit(3)"), say("judge"))
+    assert run([evaluated], store).done == [evaluated]
+    assert store.state(evaluated) == "diverged"
+    assert store.path(evaluated, "log.txt").read_text().split() == ["train"]
+    done = json.loads(store.path(evaluated, "done.json").read_text())
+    assert done["diverged"] == json.loads(DIVERGED)
+    assert (done["rows"], done["sha256"]) == (0, {})  # it had written nothing yet
+    assert run([evaluated], store).done == [evaluated]  # and is not run again
+    assert store.path(evaluated, "log.txt").read_text().split() == ["train"]
+
+
+@pytest.mark.parametrize("status", [1, 2])
+def test_another_exit_status_is_a_failure_even_so(store, evaluated, scripts, status):
+    scripts(say("train", f"{DIVERGE}; sys.exit({status})"))
+    assert run([evaluated], store).failed == [evaluated]
+    assert store.state(evaluated) == "failed"
+
+
+def test_one_agent_of_a_population_diverges_and_the_others_are_done(
+    store, agents, trained, monkeypatch
+):
+    code = TOUCH + f"(folder / 'diverged.json').write_text({DIVERGED!r})"  # in the last folder
+    monkeypatch.setattr(local, "commands", functools.partial(local.commands, code=code))
+    assert run_group(agents, store).done == agents
+    assert [store.state(spec) for spec in agents] == ["done", "diverged"]
+    done = json.loads(store.path(agents[1], "done.json").read_text())
+    assert set(done["sha256"]) == {"metrics.csv", "checkpoint.pt"}
 
 
 # --- two commands: train, then evaluate -----------------------------------------------------------

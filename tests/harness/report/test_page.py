@@ -365,7 +365,7 @@ def test_a_page_of_both_has_both(games, report, store, suite):
     )
     merged = Results(
         both, control.metrics | some.metrics, [], control.done + some.done, some.evaluations,
-        control.folders | some.folders,
+        control.folders | some.folders, scores=control.scores | some.scores,
     )  # fmt: skip
     folder, claims, page = report(merged)
     assert [h[:7] for h in page.headings if h.startswith("Table")] == ["Table 1", "Table 2"]
@@ -408,7 +408,7 @@ def test_the_verdict_of_claim_d_is_on_the_page(games, report):
     assert [(row[0], row[2], row[3], row[4]) for row in rows] == [
         ("reg - plain: success, seen levels", "0.5", "0.5 to 0.5", "10"),
         ("reg - plain: success, unseen levels", "0.5", "0.5 to 0.5", "10"),
-        ("reg / plain - 1: time for a step, CoinRun, unknown", "0", "0 to 0", "10"),
+        ("reg / plain - 1: time for a step, CoinRun, single file", "0", "0 to 0", "10"),
     ]
 
 

@@ -55,6 +55,7 @@ def test_an_agent_that_failed_before_its_first_update_counts(store, suite):
     store.start(spec, ["true"], [spec])
     failure = {"update": 1, "what": "loss", "message": "loss is NaN"}
     write_json(store.path(spec, "diverged.json"), failure)
+    store.finish(spec, returncode=3, seconds=1.0)
     row = table(suite, store)
     assert (row["failed"], row["updates"], row["steps"]) == (True, 0, 0)
 
