@@ -120,13 +120,11 @@ def gradient_share(args: Args, learner: Any, *batch: Tensor) -> dict[str, float]
     """As the single file measures it: by its own loss, on the learner's own actor."""  # condwrap
     obs = batch[0]  # condwrap
 
-    def plain_loss() -> Tensor:  # condwrap
+    def plain() -> Tensor:  # condwrap
         return ppo_reg.actor_loss(args, learner, *batch)[0]  # condwrap
 
     with torch.enable_grad():  # condwrap
-        return learner.probe.gradient_share(
-            learner.update, learner.actor, obs, plain_loss
-        )  # condwrap
+        return learner.probe.gradient_share(learner.update, learner.actor, obs, plain)  # condwrap
 
 
 @torch.no_grad()

@@ -6,10 +6,10 @@ import dataclasses
 import itertools
 import json
 import os
-import shutil
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -471,10 +471,15 @@ def test_a_population_that_ends_between_checkpoints_cannot_be_extended(module, t
 # --- the file as a program -----------------------------------------------------------------------
 
 
-def start(module, folder, *flags: str) -> subprocess.Popen:
-    """The program, copied beside the files that it needs into a folder that holds nothing else."""
+def start(module, folder, *flags: str, marker: str | None = None) -> subprocess.Popen:
+    """The program, copied beside the files that it needs into a folder that holds nothing else.
+
+    Without the lines that hold the marker, if one is given.
+    """
     for copied in (population, single_of(module), module):
-        shutil.copy(copied.__file__, folder)
+        lines = Path(copied.__file__).read_text().splitlines()
+        kept = [line for line in lines if marker is None or marker not in line]
+        (folder / Path(copied.__file__).name).write_text("\n".join(kept))
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     own = ["--env-id=Pendulum-v1", "--num-agents=2"]
     command = [sys.executable, f"{name(module)}.py", *FLAGS, *own, *flags]
@@ -490,6 +495,28 @@ def test_it_runs_when_copied_beside_the_single_file(module, tmp_path):
     for agent in range(2):
         run = tmp_path / "runs" / f"Pendulum-v1__{name(single_of(module))}__s1__a{agent}"
         assert len(read_metrics(run)) == 2
+
+
+def test_coefficient_0_is_the_files_without_their_condwrap_lines(module, tmp_path):
+    folders = [tmp_path / "ours", tmp_path / "plain"]
+    settings = [(["--coefficient=0"], None), ([], "# condwrap")]
+    for folder, (flags, marker) in zip(folders, settings, strict=True):
+        folder.mkdir()
+        more = ("--total-timesteps=320", "--run-dir=a{agent}", *flags)
+        ended = start(module, folder, *more, marker=marker).wait()
+        assert ended == 0, (folder / "log.txt").read_text()
+
+    plain_code = (folders[1] / f"{name(module)}.py").read_text()
+    assert "penalty" not in plain_code.split('"""', 2)[2]
+    for agent in range(2):
+        ours, plain = [folder / f"a{agent}" for folder in folders]
+        plain_rows = without_speed(plain)
+        shared = [{key: row[key] for key in plain_rows[0]} for row in without_speed(ours)]
+        assert shared == plain_rows
+        saved = [torch.load(x / "checkpoint.pt", weights_only=True) for x in (ours, plain)]
+        ours, plain = [each["learner"] for each in saved]
+        assert ours.keys() - plain.keys() == {"regularizer", "probe"}
+        check_close({key: ours[key] for key in plain}, plain, 0.0)
 
 
 def test_a_killed_process_continues_as_if_undisturbed(tmp_path):
