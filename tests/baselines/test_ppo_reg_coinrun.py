@@ -114,6 +114,24 @@ def test_a_rollout_by_hand():
     assert data.successes == [True, False]
 
 
+class Cut(Scripted):
+    """Its episodes are cut by a time limit."""
+
+    def step_wait(self):
+        frames, rewards, ends, cuts, info = super().step_wait()
+        return frames, rewards, cuts, ends, info
+
+
+def test_a_time_limit_is_an_end():
+    args = make_args(num_envs=1, num_groups=1, num_steps=5, num_minibatches=1)
+    learner = Learner(args)
+    learner.agent = ShowsStep()
+    envs = [Cut([[3]])]
+    data = rollout(args, learner, envs, [envs[0].reset()[0]])
+    assert data.dones.flatten().tolist() == [0, 0, 1, 0, 0]
+    assert data.next_values.flatten().tolist() == [1, 2, 0, 0, 1]
+
+
 def test_the_states_that_count_leave_out_the_resets():
     """psi is measured on them: the frame that a reset step saw is the last of an episode."""
     data = scripted_rollout([3, 2], [], num_steps=7)
@@ -454,7 +472,7 @@ def test_l2_is_half_the_squared_weights_without_biases():
     batch, agent = batch_of(data), learner.agent
     for name, p in agent.named_parameters():
         if name.endswith("bias"):
-            nn.init.constant_(p, 0.01)
+            nn.init.ones_(p)  # their squares would make up a third
     plain = loss_of(args, learner, batch)
     heavy = loss_of(dataclasses.replace(args, l2=0.1), learner, batch)
     kernels = [m.weight for m in agent.modules() if isinstance(m, nn.Conv2d | nn.Linear)]

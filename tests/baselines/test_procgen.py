@@ -364,6 +364,35 @@ def test_sampled_play_is_decided_by_the_generator(make):
     assert len(set(lengths(0))) > 1
 
 
+class OneStep:
+    """Episodes of one step; it keeps the actions."""
+
+    num_envs = 50_000
+
+    def reset(self, seed):
+        return np.zeros((self.num_envs, 1), np.uint8), {}
+
+    def step(self, actions):
+        self.actions = actions
+        zeros = np.zeros(self.num_envs)
+        info = {"episode": {"r": zeros, "l": zeros}, "_episode": np.ones(self.num_envs, bool)}
+        return None, zeros, zeros, zeros, {**info, "success": zeros, "level_seed": zeros}
+
+
+def test_sampled_play_acts_as_the_policy_is_distributed():
+    logprobs = torch.randn(15, generator=torch.Generator().manual_seed(0)).log_softmax(-1)
+
+    class Fixed(Mover):
+        def forward(self, frames):
+            return logprobs.repeat(len(frames), 1), None
+
+    env = OneStep()
+    play(Fixed(), env, 0, torch.Generator().manual_seed(1))
+    expected = env.num_envs * logprobs.exp().double().numpy()
+    found = np.bincount(env.actions, minlength=15)
+    assert ((found - expected) ** 2 / expected).sum() < 36.1  # 99.9% of chi-square of 14
+
+
 def test_play_is_without_dropout_and_leaves_the_agent_training():
     agent = Mover()
     play(agent, Scripted(lengths=[[3]]), 0, None)
