@@ -4,7 +4,15 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 INSTALLED := .venv/installed
 
-.PHONY: help run test tests slow check bench lock clean
+# What `make mutate` changes, and how many changes to a module it draws; 0: all, which takes hours.
+MODULES ?= $(wildcard condwrap/[a-z]*.py) baselines/ppo_reg.py baselines/trpo_reg.py \
+	harness/suite.py harness/store.py harness/report/table1.py harness/report/table2.py \
+	$(firstword $(wildcard harness/statistics harness/statistics.py)) \
+	$(firstword $(wildcard harness/report/claims harness/report/claims.py)) \
+	$(firstword $(wildcard harness/evaluation harness/evaluate.py))
+SAMPLE ?= 60
+
+.PHONY: help run test tests slow check bench mutate lock clean
 
 help:  ## what each target does
 	@sed -n 's/^\([a-z]*\):.*##/\1\t/p' Makefile | expand -t 10
@@ -33,6 +41,10 @@ bench: $(INSTALLED)  ## benchmarks beside their peers, as one table; under half 
 		--benchmark-json=benchmarks.json --benchmark-columns=median
 	$(BIN)/python -m tests.benchmarks.table benchmarks.json
 	$(BIN)/python -m tests.benchmarks.figure benchmarks.json benchmarks.png
+
+mutate: $(INSTALLED)  ## how many small changes the tests notice; MODULES=... chooses, SAMPLE=0 makes all
+	$(BIN)/python -m pip install --quiet --no-deps mutmut==3.8.1 libcst==1.9.0
+	$(BIN)/python tests/mutation --sample $(SAMPLE) $(MODULES)
 
 $(INSTALLED): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

@@ -2,4 +2,7 @@
 
 import os
 
+# programs that need what only `make mutate` installs
+collect_ignore = ["mutation/__main__.py", "mutation/changes.py"]
+
 os.environ["OMP_NUM_THREADS"] = "1"  # before PyTorch is imported

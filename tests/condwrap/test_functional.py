@@ -93,6 +93,22 @@ def test_penalty_with_other_ranges(library, lambda_min, lambda_max, expected):
     np.testing.assert_array_equal(np.asarray(psi), expected)
 
 
+@pytest.mark.parametrize("wide", ["output", "delta"])
+@library
+def test_mixed_dtypes_are_promoted(library, wide):
+    """float32 beside float64 gives float64: 5 / 2 with a ninth digit that float32 lacks."""
+    make = LIBRARIES[library]
+    change = np.array([[3.0, 4.0]]) * (1 + 1e-9 * (wide == "output"))
+    length = np.array([[0.0, 2.0]]) / (1 + 1e-9 * (wide == "delta"))
+    dtypes = {"output": ("float64", "float32"), "delta": ("float32", "float64")}[wide]
+    output = make(np.zeros((1, 2), dtypes[0]))
+    quotient = conditioning_quotient(
+        output, make(change.astype(dtypes[0])), make(length.astype(dtypes[1]))
+    )
+    assert str(quotient.dtype).endswith("float64")
+    np.testing.assert_allclose(np.asarray(quotient), [2.5 * (1 + 1e-9)], rtol=1e-13)
+
+
 @library
 def test_batch_ndim_0_gives_one_quotient_of_the_whole_batch(library):
     quotient = conditioning_quotient(

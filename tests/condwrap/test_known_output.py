@@ -94,3 +94,37 @@ def test_dropout_inside_a_recurrent_layer_is_refused():
 
     with pytest.raises(ValueError, match="GRU"):
         ConditioningRegularizer()(policy, obs, output=policy(obs))
+
+
+class Counting(nn.Module):
+    """Counts its evaluations in a buffer, in training mode and out of it."""
+
+    def __init__(self):
+        super().__init__()
+        self.net = mlp()
+        self.register_buffer("calls", torch.zeros(()))
+
+    def forward(self, obs):
+        self.calls += 1
+        return self.net(obs)
+
+
+def test_buffers_are_left_as_they_were():
+    policy, obs = Counting(), torch.randn(5, 4)
+    output = policy(obs)
+    calls = policy.calls
+    ConditioningRegularizer()(policy, obs, output=output)
+    assert policy.calls is calls
+    assert calls == 1
+
+
+def test_the_global_random_state_is_left_as_it_was():
+    net, obs = mlp(), torch.randn(5, 4)
+
+    def noisy(obs):
+        return net(obs) + torch.rand(())
+
+    output = noisy(obs)
+    state = torch.get_rng_state()
+    ConditioningRegularizer()(noisy, obs, output=output)
+    assert torch.equal(torch.get_rng_state(), state)

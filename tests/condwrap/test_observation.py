@@ -95,6 +95,17 @@ def test_delta_is_float64_for_float64_and_float32_otherwise(obs_dtype, dtype):
     assert read({"x": torch.ones(4, 2, dtype=obs_dtype)}).dtype == dtype
 
 
+def test_float64_beside_float32_is_perturbed_in_float64():
+    """A delta of 1 + 1e-9 survives in the float64 leaf; each leaf keeps its own dtype."""
+    states = read({"a": torch.ones(4, 2), "b": torch.ones(4, 1, dtype=torch.float64)})
+    assert states.dtype == torch.float64
+    delta = torch.full((4, 3), 1 + 1e-9, dtype=torch.float64)
+    narrow, wide = states.displacement(delta)
+    assert (narrow.dtype, wide.dtype) == (torch.float32, torch.float64)
+    assert (wide > 1).all()
+    assert (narrow == 1).all()
+
+
 @pytest.mark.parametrize(
     ("size", "fraction", "chosen"),
     [

@@ -46,6 +46,12 @@ def test_delta_worked_out_by_hand(library, name, expected):
     np.testing.assert_allclose(np.asarray(delta), expected, rtol=1e-14)
 
 
+@every_map
+def test_the_default_radius_is_1(name):
+    z = noise(4, 3)
+    np.testing.assert_array_equal(MAPS[name](z), MAPS[name](z, radius=1.0))
+
+
 @pytest.mark.parametrize("radius", [1e-3, 1.0, 7.0])
 def test_sphere_has_length_radius_on_any_leading_axes(radius):
     delta = sphere(noise(3, 4, 5), radius)

@@ -179,6 +179,33 @@ def test_batch_norm_is_found_in_any_callable(holder):
     assert net.num_batches_tracked == 0
 
 
+def test_the_search_goes_two_steps_deep_and_partials_are_free():
+    """A function that holds an agent that holds a module; what lies deeper is the agent's own."""
+
+    def is_found(policy):
+        with untouched(policy, CPU):
+            found = not net.training
+        assert net.training
+        return found
+
+    net = nn.BatchNorm1d(3)
+    two = (lambda agent: lambda obs: agent.act(obs))(Agent(net))
+    three = (lambda policy: lambda obs: policy(obs))(two)
+    partial = functools.partial
+    assert is_found(two)
+    assert is_found(partial(partial(partial(two))))
+    assert not is_found(three)
+    assert not is_found(partial(three))
+
+
+def test_classes_and_python_modules_are_not_searched():
+    class Holder:
+        net = nn.BatchNorm1d(3)
+
+    with untouched(lambda obs: (Holder.net, nn.functional)[0](obs), CPU):
+        assert Holder.net.training
+
+
 def test_a_variable_that_is_not_yet_filled_does_no_harm():
     net = nn.BatchNorm1d(3)
 

@@ -89,6 +89,13 @@ def test_the_range_is_the_range_asked_for(lambda_min, lambda_max, psi):
     assert conditioning.psi.tolist() == psi
 
 
+def test_a_quotient_at_a_bound_is_neither_below_nor_above():
+    regularizer = ConditioningRegularizer(lambda_min=0.5, lambda_max=30.0)
+    conditioning = regularizer(linear(DIAGONAL), torch.zeros(2, 2), delta=DELTA[:2])
+    assert conditioning.quotient.tolist() == [30.0, 0.5]
+    assert conditioning.fraction_below == conditioning.fraction_above == 0.0
+
+
 def test_the_penalty_is_proportional_to_the_coefficient():
     penalties = [
         ConditioningRegularizer(coefficient)(mlp_of_seed(1), torch.ones(8, 4)).penalty

@@ -111,3 +111,32 @@ def test_observations_are_perturbed_where_asked():
 def test_a_flag_out_of_range_is_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         PenaltyArgs(**changes).check_conditioning()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"coefficient": 0.0, "lambda_min": 0.0, "lambda_max": 0.0},
+        {"probe_fraction": 0.01, "log_spectrum": 1},
+    ],
+)
+def test_the_ends_of_a_range_are_in_it(changes):
+    PenaltyArgs(**changes).check_conditioning()
+
+
+def test_noise_is_drawn_on_the_device_that_is_asked_for(monkeypatch):
+    devices = []
+    make = torch.Generator
+
+    def spy(device="cpu"):
+        devices.append(device)
+        return make()
+
+    monkeypatch.setattr(torch, "Generator", spy)
+    PenaltyArgs().make_regularizer(seed=0, device="cuda:0")
+    assert devices == ["cuda:0"]
+    PenaltyArgs().make_probe(seed=0, device="cuda:1")
+    assert devices == ["cuda:0", "cuda:1", "cuda:1"]
+    PenaltyArgs().make_probe(seed=0)
+    assert devices[3:] == ["cpu", "cpu"]

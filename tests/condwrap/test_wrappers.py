@@ -206,6 +206,14 @@ def test_every_constructor_argument_is_recorded(wrapper):
     assert wrap(wrapper, SPACES["vector"], **options)._saved_kwargs == options
 
 
+@pytest.mark.parametrize("wrapper", WRAPPERS)
+def test_a_sphere_of_length_1_is_the_default(wrapper):
+    env = wrap(wrapper, SPACES["float64"])
+    obs, info = env.reset(seed=0)
+    assert np.linalg.norm(obs - info["clean_obs"]) == pytest.approx(1.0)
+    assert env._saved_kwargs == {"perturbation": "sphere", "radius": 1.0}
+
+
 @pytest.mark.parametrize(
     "options", [{}, {"perturbation": "uniform", "radius": 0.25}, {"perturbation": "gaussian"}]
 )
@@ -356,6 +364,16 @@ def test_a_masked_reset_leaves_the_other_environments_as_they_were():
     still_first, _ = envs.reset(seed=[0, None, None], options={"reset_mask": ~mask})
     assert same(still_first[0], before[0])
     assert not same(still_first[2], before[2])
+
+
+def test_the_callers_mask_can_be_used_again():
+    """What `info` says of a reset stays when the caller writes the next mask into its array."""
+    envs = VectorPerturbObservation(sync("float64", AutoresetMode.DISABLED))
+    envs.reset(seed=0)
+    mask = np.array([False, True, False])
+    _, info = envs.reset(options={"reset_mask": mask})
+    mask[:] = True
+    assert info["_clean_obs"].tolist() == [False, True, False]
 
 
 def test_seeds_of_environments_that_are_not_reset_change_nothing():

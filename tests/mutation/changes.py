@@ -1,0 +1,101 @@
+"""The small changes: mutmut's operators, which keep comments and layout, and four of our own."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Iterator
+
+import libcst as cst
+from libcst.metadata import MetadataWrapper
+from mutmut.mutation import mutators
+
+# what a call becomes: mistakes that type checkers and shapes don't reveal
+CALLS = {
+    "mean": "sum",
+    "sum": "mean",
+    "median": "mean",
+    "min": "max",
+    "max": "min",
+    "any": "all",
+    "all": "any",
+    "ceil": "floor",
+    "sqrt": "square",
+    "square": "sqrt",
+}
+
+
+def other_call(node: cst.Call) -> Iterator[cst.CSTNode]:
+    name = node.func.attr if isinstance(node.func, cst.Attribute) else node.func
+    if isinstance(name, cst.Name) and name.value in CALLS:
+        yield node.with_deep_changes(name, value=CALLS[name.value])
+
+
+def drop_argument(node: cst.Call) -> Iterator[cst.CSTNode]:
+    """Without a keyword's argument, or the last one: others leave a call that raises."""
+    for i, arg in enumerate(node.args):
+        if arg.keyword or (i > 0 and i == len(node.args) - 1):
+            yield node.with_changes(args=[*node.args[:i], *node.args[i + 1 :]])
+
+
+def negate_test(node: cst.If | cst.While) -> Iterator[cst.CSTNode]:
+    test = node.test.with_changes(lpar=[cst.LeftParen()], rpar=[cst.RightParen()])
+    yield node.with_changes(test=cst.UnaryOperation(cst.Not(), test))
+
+
+def drop_statement(node: cst.SimpleStatementLine) -> Iterator[cst.CSTNode]:
+    body = node.body[0]
+    is_call = isinstance(body, cst.Expr) and isinstance(body.value, cst.Call)
+    if is_call or isinstance(body, cst.AugAssign):
+        yield node.with_changes(body=[cst.Pass()])
+
+
+def other_string(node: cst.SimpleString) -> list[cst.CSTNode]:
+    return list(mutators.operator_string(node))[:1]  # the others change its case
+
+
+Operator = Callable[..., Iterator[cst.CSTNode] | list[cst.CSTNode]]
+OPERATORS: list[tuple[object, Operator]] = [
+    (cst.BaseNumber, mutators.operator_number),
+    (cst.SimpleString, other_string),
+    (cst.Name, mutators.operator_name),
+    (cst.AugAssign, mutators.operator_augmented_assignment),
+    (cst.UnaryOperation, mutators.operator_remove_unary_ops),
+    (cst.CSTNode, mutators.operator_keywords),
+    (cst.CSTNode, mutators.operator_swap_op),
+    (cst.IfExp, mutators.operator_if_exp),
+    (cst.Call, other_call),
+    (cst.Call, drop_argument),
+    (cst.If | cst.While, negate_test),
+    (cst.SimpleStatementLine, drop_statement),
+]
+
+
+def find_changes(
+    node: cst.CSTNode, told: bool = False
+) -> Iterator[tuple[cst.CSTNode, cst.CSTNode]]:
+    """Each node that can change and what takes its place.
+
+    Annotations and the wording of errors are left out; `told` says that an error is being raised.
+    """
+    if isinstance(node, cst.Annotation | cst.Import | cst.ImportFrom):
+        return
+
+    told = told or isinstance(node, cst.Raise)
+    for kind, operator in OPERATORS:
+        if isinstance(node, kind) and not (told and isinstance(node, cst.SimpleString)):
+            for changed in operator(node):
+                yield node, changed
+    for child in node.children:
+        yield from find_changes(child, told)
+
+
+def make_mutants(source: str) -> dict[str, str]:
+    """All mutants of a module: a line that says what changes, and the module's text."""
+    module = MetadataWrapper(cst.parse_module(source)).module
+    mutants: dict[str, str] = {}
+    for node, changed in find_changes(module):
+        text = module.deep_replace(node, changed).code
+        lines = difflib.ndiff(source.splitlines(), text.splitlines())
+        name = " ".join(f"{line[0]} {line[2:].strip()}" for line in lines if line[0] in "+-")
+        mutants[name] = text
+    return mutants
