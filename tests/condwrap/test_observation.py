@@ -1,5 +1,6 @@
 """Observations taken apart and put together: scales, structure, subsets, bad input."""
 
+import dataclasses
 import re
 
 import numpy as np
@@ -31,6 +32,34 @@ def test_floating_and_uint8_leaves_are_perturbed_in_their_own_units():
     torch.testing.assert_close(vector, delta[:, :3])
     torch.testing.assert_close(image, 255 * delta[:, 3:].reshape(4, 2, 2))
     assert image.dtype == torch.float32
+
+
+def test_two_batch_axes_are_displaced_in_their_own_units():
+    obs = {
+        "vector": torch.zeros(2, 3, 1),
+        "image": torch.zeros(2, 3, 2, dtype=torch.uint8),
+    }
+    delta = torch.arange(18.0).reshape(2, 3, 3)
+    vector, image = read(obs, batch_ndim=2).displacement(delta)
+    assert vector.tolist() == delta[..., :1].tolist()
+    assert image.tolist() == (255 * delta[..., 1:]).tolist()
+
+
+def test_autocast_widens_half_precision_alone():
+    dtypes = (torch.bfloat16, torch.float16, torch.float32, torch.float64, torch.uint8)
+    obs = [torch.ones(4, 2, dtype=dtype) for dtype in dtypes]
+    assert [x.dtype for x in read(obs).tensors] == list(dtypes)
+    with torch.autocast("cpu", torch.bfloat16):
+        widened = [x.dtype for x in read(obs).tensors]
+    assert widened == [torch.float32, torch.float32, *dtypes[2:]]
+
+
+def test_states_cannot_be_changed():
+    states = read(torch.ones(4, 2))
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        states.batch_ndim = 2
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        states.leaves[0].scale = 2.0
 
 
 def test_leaves_that_are_not_perturbed_pass_as_they_are():

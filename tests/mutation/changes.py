@@ -1,4 +1,4 @@
-"""The small changes: mutmut's operators, which keep comments and layout, and four of our own."""
+"""The small changes: mutmut's operators, which keep comments and layout, and others of our own."""
 
 from __future__ import annotations
 
@@ -24,6 +24,11 @@ CALLS = {
 }
 
 
+def is_strict(node: cst.CSTNode) -> bool:
+    keyword = node.keyword if isinstance(node, cst.Arg) else None
+    return keyword is not None and keyword.value == "strict"
+
+
 def other_call(node: cst.Call) -> Iterator[cst.CSTNode]:
     name = node.func.attr if isinstance(node.func, cst.Attribute) else node.func
     if isinstance(name, cst.Name) and name.value in CALLS:
@@ -33,7 +38,8 @@ def other_call(node: cst.Call) -> Iterator[cst.CSTNode]:
 def drop_argument(node: cst.Call) -> Iterator[cst.CSTNode]:
     """Without a keyword's argument, or the last one: others leave a call that raises."""
     for i, arg in enumerate(node.args):
-        if arg.keyword or (i > 0 and i == len(node.args) - 1):
+        can_go = arg.keyword or (i > 0 and i == len(node.args) - 1)
+        if can_go and not is_strict(arg):
             yield node.with_changes(args=[*node.args[:i], *node.args[i + 1 :]])
 
 
@@ -53,6 +59,12 @@ def other_string(node: cst.SimpleString) -> list[cst.CSTNode]:
     return list(mutators.operator_string(node))[:1]  # the others change its case
 
 
+def drop_context(node: cst.With) -> Iterator[cst.CSTNode]:
+    if not any(item.asname for item in node.items):
+        yield cst.If(test=cst.Name("True"), body=node.body)
+
+
+Change = tuple[cst.CSTNode, cst.CSTNode]
 Operator = Callable[..., Iterator[cst.CSTNode] | list[cst.CSTNode]]
 OPERATORS: list[tuple[object, Operator]] = [
     (cst.BaseNumber, mutators.operator_number),
@@ -67,17 +79,17 @@ OPERATORS: list[tuple[object, Operator]] = [
     (cst.Call, drop_argument),
     (cst.If | cst.While, negate_test),
     (cst.SimpleStatementLine, drop_statement),
+    (cst.With, drop_context),
 ]
 
 
-def find_changes(
-    node: cst.CSTNode, told: bool = False
-) -> Iterator[tuple[cst.CSTNode, cst.CSTNode]]:
+def find_changes(node: cst.CSTNode, told: bool = False) -> Iterator[Change]:
     """Each node that can change and what takes its place.
 
-    Annotations and the wording of errors are left out; `told` says that an error is being raised.
+    Annotations, the `strict` of zip, which acts on a bug alone, and the wording of errors are left
+    out; `told` says that an error is being raised.
     """
-    if isinstance(node, cst.Annotation | cst.Import | cst.ImportFrom):
+    if isinstance(node, cst.Annotation | cst.Import | cst.ImportFrom) or is_strict(node):
         return
 
     told = told or isinstance(node, cst.Raise)
