@@ -84,6 +84,16 @@ def test_a_constant_has_a_jacobian_of_0(output):
     assert got.eq(0).all()
 
 
+def test_the_default_device_plays_no_part():
+    """All is made where the states are, so that a policy on a GPU needs no default device."""
+    policy, obs = mlp(), torch.randn(5, 4)
+    expected = jacobian(policy, obs)
+    with torch.device("meta"):
+        got = jacobian(policy, obs)
+    assert got.device.type == "cpu"
+    assert torch.equal(got, expected)
+
+
 def test_a_jacobian_can_be_differentiated():
     obs = torch.randn(3, 2, dtype=torch.float64)
     weight = torch.randn(4, 2, dtype=torch.float64, requires_grad=True)

@@ -58,6 +58,16 @@ def test_sphere_has_length_radius_on_any_leading_axes(radius):
     np.testing.assert_allclose(np.linalg.norm(delta, axis=-1), np.full((3, 4), radius))
 
 
+@every_map
+@pytest.mark.parametrize("leading", [(), (2,), (2, 3)])
+def test_leading_axes_index_states(name, leading):
+    """Each row of four coordinates is mapped as it is alone, whatever the number of rows."""
+    z = noise(*leading, 4)
+    rows = [MAPS[name](row, radius=0.5) for row in z.reshape(-1, 4)]
+    expected = np.stack(rows).reshape(z.shape)
+    np.testing.assert_allclose(MAPS[name](z, radius=0.5), expected, rtol=1e-14)
+
+
 def test_sphere_keeps_the_direction_of_the_noise():
     z = noise(20, 5)
     cosine = (z * sphere(z)).sum(-1) / np.linalg.norm(z, axis=-1)

@@ -429,6 +429,35 @@ def test_seed_and_generator_choose_the_noise():
     assert not torch.equal(by_seed, ConditioningRegularizer(generator=generator).sample_delta(obs))
 
 
+@pytest.mark.parametrize("estimator", ["difference", "jvp"])
+@pytest.mark.parametrize("coefficient", [0.0, 1.0])
+def test_the_default_device_plays_no_part(coefficient, estimator):
+    """All is made where the states are, so that a policy on a GPU needs no default device."""
+    policy, obs = mlp(), torch.randn(7, 4)
+    results = []
+    for default in ("cpu", "meta"):
+        regularizer = ConditioningRegularizer(coefficient, fraction=0.5, estimator=estimator)
+        with torch.device(default):
+            conditioning = regularizer(policy, obs)
+            results.append((conditioning.penalty.item(), conditioning.metrics()))
+    assert results[0] == results[1]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_generator_on_the_gpu_draws_there_for_states_on_either_device():
+    for device in ("cuda", "cpu"):
+        regularizer = ConditioningRegularizer(generator=torch.Generator("cuda").manual_seed(3))
+        drawn = torch.randn(6, 4, generator=torch.Generator("cuda").manual_seed(3), device="cuda")
+        obs = torch.ones(6, 4, device=device)
+        expected = sphere(drawn).to(device)
+        torch.testing.assert_close(regularizer.sample_delta(obs), expected)
+        assert regularizer(mlp().to(device), obs).quotient.device.type == device
+    state = regularizer.state_dict()
+    expected = regularizer.sample_delta(obs)
+    regularizer.load_state_dict({name: x.cuda() for name, x in state.items()})
+    assert torch.equal(regularizer.sample_delta(obs), expected)
+
+
 def test_a_saved_regularizer_resumes_the_same_noise(tmp_path):
     obs = torch.ones(4, 3)
     regularizer = ConditioningRegularizer(seed=3)

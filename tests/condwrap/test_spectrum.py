@@ -672,6 +672,16 @@ def test_the_draw_is_that_of_seed_0_by_default(measure):
     assert not torch.equal(by_seed[1], default)
 
 
+@every_measure
+def test_the_default_device_plays_no_part(measure):
+    """All is made where the states are, so that a policy on a GPU needs no default device."""
+    policy, obs = mlp(), torch.randn(5, 4)
+    expected = measure(policy, obs)
+    with torch.device("meta"):
+        got = measure(policy, obs)
+    assert torch.equal(got, expected)
+
+
 @drawn_measures
 def test_a_generator_draws_anew_at_each_call(measure):
     policy, obs, options = mlp(), torch.randn(6, 4), ONE_DRAW[measure]
