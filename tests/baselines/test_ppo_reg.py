@@ -5,6 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import signal
+import sys
+import types
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -12,6 +16,7 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.utils import RunningMeanStd
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from baselines import ppo_reg
 from baselines.ppo_reg import (
@@ -25,7 +30,7 @@ from baselines.ppo_reg import (
     gae,
     train,
 )
-from tests.baselines.helpers import pendulum, read_metrics, weights, without_speed
+from tests.baselines.helpers import interrupted, pendulum, read_metrics, weights, without_speed
 
 
 class Count(gym.Env):
@@ -279,6 +284,86 @@ def test_the_defaults_are_the_standard_setting():
     assert conditioning <= settings.keys()
 
 
+@pytest.mark.parametrize(
+    ("name", "refused", "taken"),
+    [
+        ("num_envs", [0], [1]),
+        ("num_steps", [0], [2000]),
+        ("num_minibatches", [0, 3, 2000], [1, 1000]),
+        ("update_epochs", [0], [1]),
+        ("vf_epochs", [0], [1]),
+        ("checkpoint_interval", [0], [1]),
+        ("seed", [-1], [0]),
+        ("agent", [-1], [0]),
+        ("reward_clip", [-0.1, math.nan], [0.0]),
+        ("hidden_sizes", [(0,), (8, 0)], [(1,), ()]),
+        ("learning_rate", [0.0, -1.0, math.inf, math.nan], [0.5]),
+        ("vf_learning_rate", [0.0, -1.0, math.inf, math.nan], [0.5]),
+        ("clip_coef", [0.0, math.inf], [0.5]),
+        ("max_grad_norm", [0.0, math.inf], [0.5]),
+        ("output_gain", [0.0, math.inf], [0.5]),
+        ("gamma", [-0.1, 1.1, math.nan], [0.0, 1.0]),
+        ("gae_lambda", [-0.1, 1.1, math.nan], [0.0, 1.0]),
+        ("total_timesteps", [1999], [2000]),
+        ("lambda_min", [-1.0], [0.0]),
+    ],
+)
+def test_each_setting_has_its_range(name, refused, taken):
+    for value in refused:
+        with pytest.raises(ValueError, match=f"^{name} must|the range needs 0 <= {name}"):
+            Args(**{name: value})
+    for value in taken:
+        assert getattr(Args(**{name: value}), name) == value
+
+
+def test_an_error_tells_the_value_and_what_is_needed():
+    with pytest.raises(ValueError, match=r"^num_envs must be at least 1, got 0$"):
+        Args(num_envs=0)
+    message = r"num_envs \* num_steps = 4000 into parts of 2 or more, got 4000$"
+    with pytest.raises(ValueError, match=message):
+        Args(num_envs=2, num_minibatches=4000)
+
+
+def test_a_run_has_whole_updates_and_a_folder_that_names_it():
+    args = Args(env_id="a_module:Task-v0", num_envs=3, num_steps=4, num_minibatches=2, seed=7)
+    args = dataclasses.replace(args, agent=9, total_timesteps=12 * 5 + 11)
+    assert args.batch_size == 12
+    assert args.num_updates == 5
+    assert args.path == Path("runs/Task-v0__ppo_reg__s7__a9")
+    assert dataclasses.replace(args, run_dir=Path("here")).path == Path("here")
+
+
+@pytest.mark.parametrize(("activation", "kind"), [("tanh", "Tanh"), ("relu", "ReLU")])
+def test_layers_have_the_sizes_and_the_activation_that_are_asked_for(activation, kind):
+    args = Args(env_id="Pendulum-v1", activation=activation, hidden_sizes=(5, 7))
+    learner = ppo_reg.Learner(args)
+    for net, outputs in ((learner.actor.mean, 1), (learner.critic, 1)):
+        kinds = [type(layer).__name__ for layer in net]
+        assert kinds == ["Linear", kind, "Linear", kind, "Linear"]
+        assert [(x.in_features, x.out_features) for x in net[::2]] == [(3, 5), (5, 7), (7, outputs)]
+
+
+def test_each_use_of_randomness_has_a_stream_of_its_own():
+    chosen = ({"seed": 1}, {"agent": 1}, {"seed": 1, "agent": 1}, {"seed": 0})
+    args = [Args(env_id="Pendulum-v1", **{"seed": 0, **changes}) for changes in chosen]
+    seeds = []
+    for learner in map(ppo_reg.Learner, args):
+        assert list(learner.generators) == ["init", "action", "minibatch"]
+        generators = list(learner.generators.values())
+        generators += [learner.regularizer.generator, learner.probe.yardstick.generator]
+        seeds += [generator.initial_seed() for generator in generators]
+    assert len(set(seeds)) == len(seeds) == 20
+    of_envs = [
+        tuple(ppo_reg.env_seeds(dataclasses.replace(a, num_envs=2), checkpoint))
+        for a in args
+        for checkpoint in (0, 1)
+    ]
+    assert len({seed for pair in of_envs for seed in pair}) == 16
+    # the streams stay what they are, so that a run can be repeated
+    expected = np.random.SeedSequence((0, 1, 1)).generate_state(2).tolist()
+    assert list(of_envs[3]) == expected
+
+
 @pytest.mark.parametrize("output_gain", [0.01, 1.0])
 def test_networks_begin_orthogonal(output_gain):
     learner = ppo_reg.Learner(
@@ -475,6 +560,50 @@ def test_observations_of_any_shape_are_flattened(tmp_path):
     assert len(read_metrics(tmp_path)) == 1
 
 
+def test_a_bullet_task_is_found_by_its_name_alone():
+    env = ppo_reg.make_env(Args(env_id="InvertedPendulumBulletEnv-v0"))
+    named = ppo_reg.make_env(Args(env_id="pybullet_envs_gymnasium:InvertedPendulumBulletEnv-v0"))
+    assert env.spec.id == named.spec.id == "InvertedPendulumBulletEnv-v0"
+    with pytest.raises(RunError, match=r"env_id must name a task with a Box .* got Discrete\(2\)"):
+        ppo_reg.make_env(Args(env_id="CartPole-v1"))
+
+
+def test_environments_are_wrapped_as_the_settings_say():
+    def wrappers(**changes):
+        stats = {}
+        env = ppo_reg.make_envs(Args(env_id="Pendulum-v1", num_envs=2, **changes), stats)
+        assert env.num_envs == 2
+        names = []
+        while env is not env.unwrapped:
+            names.append(type(env).__name__)
+            env = env.env
+        assert env.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+        return names, list(stats)
+
+    statistics, observations, rewards, clip = (
+        "RecordEpisodeStatistics",
+        "NormalizeObservation",
+        "NormalizeReward",
+        "ClipReward",
+    )
+    both = ["obs_rms", "return_rms"]
+    assert wrappers() == ([clip, rewards, observations, statistics], both)
+    assert wrappers(reward_clip=0) == ([rewards, observations, statistics], both)
+    assert wrappers(norm_reward=False) == ([observations, statistics], ["obs_rms"])
+    assert wrappers(norm_obs=False, norm_reward=False) == ([statistics], [])
+
+
+def test_statistics_go_on_where_the_environments_are_rebuilt():
+    args = Args(env_id="Pendulum-v1", num_envs=2)
+    stats = {}
+    for seen in (2, 6):  # a reset and a step show two observations each
+        envs = ppo_reg.make_envs(args, stats)
+        envs.reset(seed=[0, 1])
+        assert stats["obs_rms"].count == pytest.approx(seen, abs=1e-3)
+        envs.step(np.zeros((2, 1), np.float32))
+    assert stats["return_rms"].count == pytest.approx(4, abs=1e-3)
+
+
 # --- the regularizer -----------------------------------------------------------------------------
 
 
@@ -595,6 +724,179 @@ def test_one_quotient_for_the_minibatch_trains_otherwise(tmp_path):
     row = read_metrics(tmp_path / "b")[-1]
     assert row["conditioning/own_quotient_q05"] == row["conditioning/own_quotient_q95"]
     assert row["conditioning/quotient_q05"] != row["conditioning/quotient_q95"]
+
+
+# --- files ---------------------------------------------------------------------------------------
+
+
+INTERVAL_2 = {"checkpoint_interval": 2, "total_timesteps": 7 * 64}
+
+
+def stop_at(update: int, args: Args, monkeypatch) -> None:
+    interrupted(ppo_reg, args, monkeypatch, at_update=update)
+
+
+@pytest.mark.parametrize("at_update", [1, 5])
+def test_a_resumed_run_ends_as_the_undisturbed_one(tmp_path, monkeypatch, at_update):
+    settings = {**INTERVAL_2, "num_envs": 2, "num_steps": 32, "coefficient": 0.5}
+    undisturbed = train(pendulum(ppo_reg, tmp_path / "a", **settings))
+    stop_at(at_update, pendulum(ppo_reg, tmp_path / "b", **settings), monkeypatch)
+    resumed = train(pendulum(ppo_reg, tmp_path / "b", resume=True, **settings))
+    assert torch.equal(weights(undisturbed), weights(resumed))
+    assert without_speed(tmp_path / "a") == without_speed(tmp_path / "b")
+    steps = [int(row["global_step"]) for row in read_metrics(tmp_path / "b")]
+    assert steps == [64 * (i + 1) for i in range(7)]
+
+
+def test_a_checkpoint_is_written_at_each_interval_and_the_one_before_is_kept(tmp_path):
+    args = pendulum(ppo_reg, tmp_path, **INTERVAL_2)
+    learner = train(args)
+    files = {path.name for path in tmp_path.iterdir() if not path.name.startswith("events")}
+    assert files == {"metrics.csv", "checkpoint.pt", "checkpoint.previous.pt"}
+    last, before = (
+        torch.load(tmp_path / name, weights_only=True)
+        for name in ("checkpoint.pt", "checkpoint.previous.pt")
+    )
+    assert [last["learner"]["update"], before["learner"]["update"]] == [7, 6]
+    kept = dataclasses.asdict(args)
+    for name in ("run_dir", "resume", "extend", "track"):
+        del kept[name]
+    assert last["args"] == kept
+    lines = (tmp_path / "metrics.csv").read_bytes().splitlines(keepends=True)
+    assert before["metrics_size"] == sum(map(len, lines[:7]))  # the header and six rows
+    assert last["metrics_size"] == sum(map(len, lines))
+    state = last["learner"]
+    assert state["obs_rms"]["mean"].tolist() == learner.stats["obs_rms"].mean.tolist()
+    assert state["obs_rms"]["count"].item() == learner.stats["obs_rms"].count
+    assert state["obs_rms"]["var"].dtype == torch.float64
+    assert set(state["generators"]) == {"init", "action", "minibatch"}
+
+
+def test_a_torn_checkpoint_falls_back_on_the_one_before(tmp_path, capsys):
+    undisturbed = train(pendulum(ppo_reg, tmp_path / "a", **INTERVAL_2))
+    train(pendulum(ppo_reg, tmp_path / "b", **INTERVAL_2))
+    (tmp_path / "b" / "checkpoint.pt").write_bytes(b"torn")
+    resumed = train(pendulum(ppo_reg, tmp_path / "b", resume=True, **INTERVAL_2))
+    assert f"{tmp_path / 'b' / 'checkpoint.pt'} cannot be read: " in capsys.readouterr().out
+    assert torch.equal(weights(undisturbed), weights(resumed))
+    assert without_speed(tmp_path / "a") == without_speed(tmp_path / "b")
+    for name in ("checkpoint.pt", "checkpoint.previous.pt"):
+        (tmp_path / "b" / name).write_bytes(b"torn")
+    with pytest.raises(RunError, match="holds no readable checkpoint: remove it"):
+        train(pendulum(ppo_reg, tmp_path / "b", resume=True, **INTERVAL_2))
+
+
+def test_a_run_is_overwritten_by_no_other(tmp_path, monkeypatch):
+    stop_at(1, pendulum(ppo_reg, tmp_path, **INTERVAL_2), monkeypatch)  # before any checkpoint
+    with pytest.raises(RunError, match=f"{tmp_path} holds a run: --resume it, or name another"):
+        train(pendulum(ppo_reg, tmp_path, **INTERVAL_2))
+    train(pendulum(ppo_reg, tmp_path, resume=True, **INTERVAL_2))
+    (tmp_path / "metrics.csv").unlink()
+    with pytest.raises(RunError, match="holds a run"):
+        train(pendulum(ppo_reg, tmp_path, **INTERVAL_2))
+
+
+def test_rows_that_a_checkpoint_counts_must_be_there(tmp_path, monkeypatch):
+    stop_at(3, pendulum(ppo_reg, tmp_path, **INTERVAL_2), monkeypatch)
+    metrics = tmp_path / "metrics.csv"
+    metrics.write_bytes(metrics.read_bytes()[:-200])
+    with pytest.raises(RunError, match=r"metrics\.csv lacks rows: remove its folder"):
+        train(pendulum(ppo_reg, tmp_path, resume=True, **INTERVAL_2))
+
+
+def test_a_finished_run_stays_as_it_is(tmp_path, capsys):
+    train(pendulum(ppo_reg, tmp_path))
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    learner = train(pendulum(ppo_reg, tmp_path, resume=True))
+    assert learner.update == 5
+    assert capsys.readouterr().out.endswith(f"{tmp_path} is finished\n")
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_tensorboard_holds_what_metrics_csv_holds_after_a_resume(tmp_path, monkeypatch):
+    stop_at(5, pendulum(ppo_reg, tmp_path, **INTERVAL_2), monkeypatch)
+    train(pendulum(ppo_reg, tmp_path, resume=True, **INTERVAL_2))
+    events = EventAccumulator(str(tmp_path)).Reload()
+    rows = read_metrics(tmp_path)
+    for name in ("conditioning/psi", "charts/learning_rate"):
+        scalars = events.Scalars(name)
+        assert [x.step for x in scalars] == [int(row["global_step"]) for row in rows]
+        assert [x.value for x in scalars] == pytest.approx([float(row[name]) for row in rows])
+    assert "conditioning/gradient_share" not in events.Tags()["scalars"]  # NaN in all rows
+    text = events.Tensors("hyperparameters/text_summary")[0].tensor_proto.string_val[0].decode()
+    assert text.startswith("|parameter|value|\n|-|-|\n|")
+    assert "|gamma|0.99|" in text
+
+
+def test_progress_is_told_at_the_start_and_the_end(tmp_path, capsys):
+    train(pendulum(ppo_reg, tmp_path))
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[1] for line in lines] == ["1/5", "5/5"]
+    assert all("steps/s" in line and "return" in line for line in lines)
+    assert all(float(row["charts/SPS"]) > 0 for row in read_metrics(tmp_path))
+
+
+def test_no_global_random_state_is_touched(tmp_path):
+    state = torch.get_rng_state()
+    train(pendulum(ppo_reg, tmp_path, perturb_obs=True))
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+# --- the program ---------------------------------------------------------------------------------
+
+
+def run_main(monkeypatch, *flags: str) -> None:
+    monkeypatch.setattr("sys.argv", ["ppo_reg.py", *flags])
+    monkeypatch.setattr("sys.stdout.reconfigure", lambda **options: None, raising=False)
+    kept = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        ppo_reg.main()
+    finally:
+        for number, handler in kept.items():
+            signal.signal(number, handler)
+
+
+SHORT = ["--env-id=Pendulum-v1", "--num-steps=64", "--num-minibatches=4", "--total-timesteps=64"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--env-id=CartPole-v1"], "error: env_id must name a task with a Box of actions"),
+        (["--env-id=Hoper-v0"], "error: Environment `Hoper` doesn't exist"),
+        (["--env-id=no_such_module:Task-v0"], "error: No module named 'no_such_module'"),
+    ],
+)
+def test_an_error_ends_the_program_with_what_to_do(tmp_path, monkeypatch, flags, message):
+    with pytest.raises(SystemExit, match=message):
+        run_main(monkeypatch, *flags, f"--run-dir={tmp_path}")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_program_with_how_to_go_on(tmp_path, monkeypatch, number):
+    monkeypatch.setattr(ppo_reg, "update", lambda *args: signal.raise_signal(number))
+    with pytest.raises(SystemExit, match="interrupted: --resume continues from the last"):
+        run_main(monkeypatch, *SHORT, f"--run-dir={tmp_path}")
+
+
+def test_the_program_trains_with_one_thread_and_its_flags(tmp_path, monkeypatch):
+    run_main(monkeypatch, *SHORT, f"--run-dir={tmp_path}", "--coefficient=0.25")
+    saved = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    assert saved["args"]["coefficient"] == 0.25
+    assert saved["learner"]["update"] == 1
+    assert torch.get_num_threads() == 1
+
+
+def test_weights_and_biases_is_asked_for_by_track(tmp_path, monkeypatch):
+    asked = []
+    fake = types.SimpleNamespace(init=lambda **options: asked.append(options))
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+    run_main(monkeypatch, *SHORT, f"--run-dir={tmp_path / 'plain'}")
+    assert asked == []
+    run_main(monkeypatch, *SHORT, f"--run-dir={tmp_path / 'a_name'}", "--track")
+    assert [x["name"] for x in asked] == ["a_name"]
+    assert asked[0]["config"]["total_timesteps"] == 64
+    assert asked[0]["sync_tensorboard"] is True
 
 
 # --- outcomes and longer runs --------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """Which tensor an output means, and that evaluating a policy leaves no trace in it."""
 
+import contextlib
 import functools
 import re
 
@@ -281,6 +282,21 @@ def test_two_evaluations_draw_the_same_and_the_global_state_is_kept():
             draws.append(torch.rand(5))
     assert torch.equal(*draws)
     assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_the_generator_of_the_states_gpu_is_restored_too(monkeypatch):
+    restored = []
+
+    @contextlib.contextmanager
+    def spy(devices):
+        restored.append(devices)
+        yield
+
+    monkeypatch.setattr(torch.random, "fork_rng", spy)
+    for device in (torch.device("cuda", 1), CPU):
+        with untouched(torch.relu, device):
+            pass
+    assert restored == [[torch.device("cuda", 1)], []]
 
 
 def test_everything_is_restored_after_an_error():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env, data_equivalence
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorWrapper
 
 from condwrap.wrappers import PerturbObservation, VectorPerturbObservation
 
@@ -333,6 +333,20 @@ def test_clean_observations_are_those_of_the_unwrapped_vector(space, mode):
         for i, shown, before in final_rows(SPACES[space], info):
             assert same(before, expected_info["final_obs"][i])
             assert not same(shown, before)
+
+
+def test_final_observations_without_further_infos_are_perturbed_too():
+    class Bare(VectorWrapper):
+        def step(self, actions):
+            *results, info = self.env.step(actions)
+            return *results, {k: v for k, v in info.items() if k != "final_info"}
+
+    mode = AutoresetMode.SAME_STEP
+    seen = drive(VectorPerturbObservation(Bare(sync("float64", mode)), radius=0.3), mode)
+    rows = [r for _, info, _ in seen for r in final_rows(SPACES["float64"], info)]
+    assert rows
+    for _, shown, clean in rows:
+        assert np.linalg.norm(shown - clean) == pytest.approx(0.3)
 
 
 @every_mode
