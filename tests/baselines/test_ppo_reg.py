@@ -225,6 +225,56 @@ def test_gradients_are_clipped_to_the_given_length():
     assert math.hypot(*moved) == pytest.approx(0.25, rel=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("update_epochs", "vf_epochs", "target_kl", "steps"),
+    [(3, 1, None, (12, 4)), (1, 3, None, (4, 12)), (3, 2, 1e9, (12, 8)), (3, 2, 1e-9, (4, 8))],
+)
+@pytest.mark.parametrize("coefficient", [0.0, 0.5])
+def test_every_epoch_takes_each_state_once(
+    monkeypatch, update_epochs, vf_epochs, target_kl, steps, coefficient
+):
+    """4 minibatches of 4 states; the policy stops for good once an epoch's KL is too large."""
+    args = Args(
+        num_steps=16,
+        num_minibatches=4,
+        update_epochs=update_epochs,
+        vf_epochs=vf_epochs,
+        target_kl=target_kl,
+        coefficient=coefficient,
+    )
+    learner = fixed_learner(args)
+    learner.update = 1
+    learner.actor_optimizer = torch.optim.SGD(learner.actor.parameters(), 0.01)
+    learner.critic_optimizer = torch.optim.SGD(learner.critic.parameters(), 0.01)
+    taken = []
+    deltas = []
+    optimizers = []
+
+    def spy(args, learner, obs, actions, logprobs, advantages, delta=None):
+        taken.append(obs.flatten().tolist())
+        assert (delta is None) == (coefficient == 0)
+        assert torch.equal(actions, obs + 0.5)
+        return actor_loss(args, learner, obs, actions, logprobs, advantages, delta)
+
+    learner.actor_loss = spy
+    step = ppo_reg.step
+    monkeypatch.setattr(ppo_reg, "step", lambda *x: (optimizers.append(x[0]), step(*x)))
+    sample_delta = learner.regularizer.sample_delta
+    learner.regularizer.sample_delta = lambda x: deltas.append(len(x)) or sample_delta(x)
+    obs = torch.arange(16.0)[:, None]
+    data = Rollout(
+        obs[..., None], obs[..., None] + 0.5, obs, 0 * obs, 0 * obs, 0 * obs, None, [], [], None
+    )
+    ppo_reg.update(args, learner, data)
+    of_policy = sum(x is learner.actor_optimizer for x in optimizers)
+    assert (of_policy, len(optimizers) - of_policy) == steps
+    epochs = np.reshape(taken, (-1, 16)).tolist()
+    assert all(sorted(epoch) == obs.flatten().tolist() for epoch in epochs)
+    assert all(len(minibatch) == 4 for minibatch in taken)
+    assert len({tuple(epoch) for epoch in epochs}) == len(epochs) == steps[0] / 4
+    assert deltas == [16] * (len(epochs) if coefficient else 0)
+
+
 @pytest.mark.parametrize(("number", "left"), [(1, 1.0), (2, 0.8), (5, 0.2)])
 def test_step_sizes_fall_linearly_to_0(tmp_path, number, left):
     args = pendulum(ppo_reg, tmp_path, anneal_lr=True, learning_rate=0.01, vf_learning_rate=0.04)
@@ -425,6 +475,25 @@ def test_a_terminated_episode_does_not_bootstrap():
     assert data.next_values.flatten().tolist() == [1, 2, 0, 1, 2]
     assert data.returns == [3.0]
     assert data.lengths == [3]
+
+
+def test_an_environment_that_ends_leaves_its_neighbour_alone():
+    envs = SyncVectorEnv(
+        [lambda: Count(truncate_at=2), lambda: Count(), lambda: Count(terminate_at=3)],
+        autoreset_mode=AutoresetMode.SAME_STEP,
+    )
+    envs = gym.wrappers.vector.RecordEpisodeStatistics(envs)
+    args = Args(env_id="Pendulum-v1", num_envs=3, num_steps=4, num_minibatches=1)
+    learner = fixed_learner(args)
+    next_obs, _ = envs.reset(seed=0)
+    data = ppo_reg.rollout(args, learner, envs, next_obs)
+    assert data.obs[..., 0].T.tolist() == [[0, 1, 0, 1], [0, 1, 2, 3], [0, 1, 2, 0]]
+    assert data.dones.T.tolist() == [[0, 1, 0, 1], [0, 0, 0, 0], [0, 0, 1, 0]]
+    assert data.next_values.T.tolist() == [[3, 6, 3, 6], [3, 6, 9, 12], [3, 6, 0, 3]]
+    assert data.next_obs.flatten().tolist() == [0, 4, 1]
+    assert data.returns == [2.0, 3.0, 2.0]
+    assert data.lengths == [2, 3, 2]
+    assert data.clean_obs.shape == (12, 1)
 
 
 def test_termination_wins_over_truncation():
@@ -702,8 +771,29 @@ def test_rows_count_the_episodes_that_ended(tmp_path):
     gym.register("test/Short-v0", lambda: Count(truncate_at=10))
     train(pendulum(ppo_reg, tmp_path, env_id="test/Short-v0"))
     # of 64 steps: 6, 12 after 128, 19 after 192, 25 after 256, 32 after 320
-    counts = [int(row["charts/episodes"]) for row in read_metrics(tmp_path)]
-    assert counts == [6, 6, 7, 6, 7]
+    rows = read_metrics(tmp_path)
+    assert [int(row["charts/episodes"]) for row in rows] == [6, 6, 7, 6, 7]
+    assert {float(row["charts/episodic_return"]) for row in rows} == {10.0}
+    assert {float(row["charts/episodic_length"]) for row in rows} == {10.0}
+
+
+def test_a_row_means_over_episodes_and_is_nan_without_one(tmp_path):
+    args = pendulum(ppo_reg, tmp_path)
+    learner = ppo_reg.Learner(args)
+    learner.update = 3
+    data = make_rollout([0.0], [0.0], [0.0], [0.0])
+    data = data._replace(clean_obs=torch.randn(8, 3), returns=[1.0, 5.0], lengths=[2, 3])
+    row = ppo_reg.make_row(args, learner, data, {"losses/entropy": 0.5}, speed=7.0)
+    assert row["global_step"] == 3 * 64
+    assert row["charts/episodic_return"] == 3.0
+    assert row["charts/episodic_length"] == 2.5
+    assert row["charts/episodes"] == 2
+    assert row["charts/SPS"] == 7.0
+    assert row["losses/entropy"] == 0.5
+    empty = ppo_reg.make_row(args, learner, data._replace(returns=[], lengths=[]), {}, 7.0)
+    assert math.isnan(empty["charts/episodic_return"])
+    assert math.isnan(empty["charts/episodic_length"])
+    assert empty["charts/episodes"] == 0
 
 
 def test_the_printed_sign_raises_psi(tmp_path):
@@ -796,6 +886,17 @@ def test_a_run_is_overwritten_by_no_other(tmp_path, monkeypatch):
         train(pendulum(ppo_reg, tmp_path, **INTERVAL_2))
 
 
+def test_a_malicious_checkpoint_is_not_executed(tmp_path):
+    class Exploit:
+        def __reduce__(self):
+            return Path.touch, (tmp_path / "executed",)
+
+    torch.save({"args": Exploit()}, tmp_path / "checkpoint.pt")
+    with pytest.raises(RunError, match="no readable checkpoint"):
+        train(pendulum(ppo_reg, tmp_path, resume=True))
+    assert not (tmp_path / "executed").exists()
+
+
 def test_rows_that_a_checkpoint_counts_must_be_there(tmp_path, monkeypatch):
     stop_at(3, pendulum(ppo_reg, tmp_path, **INTERVAL_2), monkeypatch)
     metrics = tmp_path / "metrics.csv"
@@ -880,11 +981,13 @@ def test_a_signal_ends_the_program_with_how_to_go_on(tmp_path, monkeypatch, numb
 
 
 def test_the_program_trains_with_one_thread_and_its_flags(tmp_path, monkeypatch):
+    threads = []
+    monkeypatch.setattr(torch, "set_num_threads", threads.append)
     run_main(monkeypatch, *SHORT, f"--run-dir={tmp_path}", "--coefficient=0.25")
     saved = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
     assert saved["args"]["coefficient"] == 0.25
     assert saved["learner"]["update"] == 1
-    assert torch.get_num_threads() == 1
+    assert threads == [1]
 
 
 def test_weights_and_biases_is_asked_for_by_track(tmp_path, monkeypatch):
