@@ -898,7 +898,7 @@ def test_a_malicious_checkpoint_is_not_executed(tmp_path):
 
 
 def test_rows_that_a_checkpoint_counts_must_be_there(tmp_path, monkeypatch):
-    stop_at(3, pendulum(ppo_reg, tmp_path, **INTERVAL_2), monkeypatch)
+    stop_at(2, pendulum(ppo_reg, tmp_path, **INTERVAL_2), monkeypatch)
     metrics = tmp_path / "metrics.csv"
     metrics.write_bytes(metrics.read_bytes()[:-200])
     with pytest.raises(RunError, match=r"metrics\.csv lacks rows: remove its folder"):
