@@ -406,7 +406,7 @@ def rollout(
         return torch.from_numpy(x).unflatten(1, agents)
 
     values = value(args, learners, by_agent(obs))
-    next_values = value(args, learners, by_agent(after)) * (1 - by_agent(ends))
+    next_values = value(args, learners, by_agent(after)).masked_fill(by_agent(ends) == 1, 0)
     columns = {
         "obs": by_agent(obs),
         "actions": actions,
@@ -689,6 +689,7 @@ def train(args: PopulationArgs, update: Callable[..., Any]) -> list[Any]:
         envs.unwrapped.store()
         envs.close()
         for i in live:
+            writers[i].flush()
             single.save_checkpoint(runs[i], learners[i])
 
     for writer in writers.values():
@@ -705,7 +706,7 @@ def print_progress(args: PopulationArgs, update: int, rows: list[dict[str, float
 
 def run(args_class: type, train: Callable[[Any], Any], description: str) -> None:
     """The program: train with the arguments of the command line."""
-    torch.set_num_threads(1)  # more do not pay for networks of this size
+    torch.set_num_threads(1)  # more do not help networks this small
     sys.stdout.reconfigure(line_buffering=True)  # progress shows in a log file too
     for stop in (signal.SIGTERM, signal.SIGINT):  # a background job may begin with SIGINT ignored
         signal.signal(stop, signal.default_int_handler)

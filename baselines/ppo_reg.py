@@ -48,7 +48,7 @@ class RunError(Exception):
 
 
 class DivergedError(Exception):
-    """A run whose own numbers became non-finite: an outcome, not a failure of the machine."""
+    """Training produced NaN or infinity: a result (exit status 3), not a crash."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,7 +169,7 @@ class Args(
 
 
 class RunningMoments(RunningMeanStd):
-    """RunningMeanStd, faster for a batch of one: its mean is itself and its variance 0."""
+    """RunningMeanStd, faster for one environment: the mean is its sample, the variance 0."""
 
     def update(self, x: np.ndarray) -> None:
         if len(x) == 1:
@@ -229,8 +229,8 @@ def make_env(args: Args) -> gym.Env:
 def make_envs(args: Args, stats: dict[str, RunningMeanStd]) -> VectorEnv:
     """The environments until the next checkpoint, with `stats` to normalize by (filled if empty).
 
-    The state of a simulator cannot be saved. So every run builds new environments at each scheduled
-    checkpoint, and an interrupted run sees the same episodes as an undisturbed one.
+    A simulator's state cannot be saved. So every run builds new environments at each checkpoint,
+    and an interrupted run sees the same episodes as an undisturbed one.
     """
     makers = [functools.partial(make_env, args)] * args.num_envs
     envs: VectorEnv = SyncVectorEnv(makers, copy=False, autoreset_mode=AutoresetMode.SAME_STEP)
@@ -260,7 +260,7 @@ ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU}
 
 
 def make_mlp(args: Args, n_in: int, n_out: int, gain: float, rng: torch.Generator) -> nn.Sequential:
-    """Layers with orthogonal weights, `gain` at the output, drawn from no global state."""
+    """Layers with orthogonal weights, `gain` at the output, drawn from `rng` alone."""
     layers: list[nn.Module] = []
     sizes = (n_in, *args.hidden_sizes, n_out)
     for i, size in enumerate(sizes[1:]):
@@ -365,7 +365,7 @@ class Rollout(NamedTuple):
 
 @torch.no_grad()
 def rollout(args: Args, learner: Learner, envs: VectorEnv, next_obs: np.ndarray) -> Rollout:
-    """Step the environments; autoreset is in the same step, so every transition counts."""
+    """Step the environments. They are reset in the same step, so every transition counts."""
     actor = learner.actor
     space = envs.single_action_space
     shape = (args.num_steps, envs.num_envs)
@@ -408,7 +408,7 @@ def rollout(args: Args, learner: Learner, envs: VectorEnv, next_obs: np.ndarray)
         rewards=torch.from_numpy(rewards),
         dones=torch.from_numpy(dones),
         values=values,
-        next_values=next_values * (1 - torch.from_numpy(ends)),
+        next_values=next_values.masked_fill(torch.from_numpy(ends) == 1, 0),
         next_obs=next_obs,
         returns=returns,
         lengths=lengths,
@@ -586,13 +586,18 @@ def write_metrics(args: Args, writer: SummaryWriter, row: dict[str, float]) -> N
 
 
 def save_checkpoint(args: Args, learner: Learner) -> None:
-    """Write a temporary file, then rename: a whole checkpoint is there whatever happens."""
+    """Write a temporary file, then rename: a crash never leaves half a checkpoint."""
     with open(args.path / "metrics.csv", "rb") as metrics:
         os.fsync(metrics.fileno())
         size = os.fstat(metrics.fileno()).st_size
 
     settings = {k: v for k, v in vars(args).items() if k not in MAY_CHANGE}
-    content = {"args": settings, "learner": learner.state_dict(), "metrics_size": size}
+    content = {
+        "version": VERSION,
+        "args": settings,
+        "learner": learner.state_dict(),
+        "metrics_size": size,
+    }
     path = args.path / "checkpoint.pt"
     with open(path.with_suffix(".tmp"), "wb") as file:
         torch.save(content, file)
@@ -614,7 +619,7 @@ def load_checkpoint(args: Args) -> dict[str, Any] | None:
     for candidate in found:
         try:
             saved = torch.load(candidate, map_location="cpu", weights_only=True)
-        except Exception as error:  # whatever a torn file makes the reader stumble over
+        except Exception as error:  # a torn file can raise almost anything
             print(f"{candidate} cannot be read: {error!r}")
             continue
         check_same(args, saved)
@@ -627,6 +632,8 @@ def load_checkpoint(args: Args) -> dict[str, Any] | None:
 
 def check_same(args: Args, saved: dict[str, Any]) -> None:
     """Raise RunError unless the run was begun with these arguments, or can be extended to them."""
+    if (version := saved.get("version", 1)) != VERSION:
+        raise RunError(f"{args.path} was run by version {version} of this file, now {VERSION}")
     longer = args.extend and args.total_timesteps > saved["args"]["total_timesteps"]
     for name, value in saved["args"].items():
         now = getattr(args, name, None)
@@ -694,6 +701,7 @@ def train(args: Args) -> Learner:
                       f"return {row['charts/episodic_return']:.1f}")  # fmt: skip
 
         envs.close()
+        writer.flush()
         save_checkpoint(args, learner)
 
     writer.close()
@@ -701,7 +709,7 @@ def train(args: Args) -> Learner:
 
 
 def main() -> None:
-    torch.set_num_threads(1)  # more do not pay for networks of this size
+    torch.set_num_threads(1)  # more do not help networks this small
     sys.stdout.reconfigure(line_buffering=True)  # progress shows in a log file too
     for stop in (signal.SIGTERM, signal.SIGINT):  # a background job may begin with SIGINT ignored
         signal.signal(stop, signal.default_int_handler)

@@ -56,7 +56,7 @@ class RunError(Exception):
 
 
 class DivergedError(Exception):
-    """A run whose own numbers became non-finite: an outcome, not a failure of the machine."""
+    """Training produced NaN or infinity: a result (exit status 3), not a crash."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -886,13 +886,18 @@ def write_metrics(args: Args, writer: SummaryWriter, row: dict[str, float]) -> N
 
 
 def save_checkpoint(args: Args, learner: Learner) -> None:
-    """Write a temporary file, then rename: a whole checkpoint is there whatever happens."""
+    """Write a temporary file, then rename: a crash never leaves half a checkpoint."""
     with open(args.path / "metrics.csv", "rb") as metrics:
         os.fsync(metrics.fileno())
         size = os.fstat(metrics.fileno()).st_size
 
     settings = {k: v for k, v in vars(args).items() if k not in MAY_CHANGE}
-    content = {"args": settings, "learner": learner.state_dict(), "metrics_size": size}
+    content = {
+        "version": VERSION,
+        "args": settings,
+        "learner": learner.state_dict(),
+        "metrics_size": size,
+    }
     path = args.path / "checkpoint.pt"
     with open(path.with_suffix(".tmp"), "wb") as file:
         torch.save(content, file)
@@ -914,7 +919,7 @@ def load_checkpoint(args: Args) -> dict[str, Any] | None:
     for candidate in found:
         try:
             saved = torch.load(candidate, map_location="cpu", weights_only=True)
-        except Exception as error:  # whatever a torn file makes the reader stumble over
+        except Exception as error:  # a torn file can raise almost anything
             print(f"{candidate} cannot be read: {error!r}")
             continue
         check_same(args, saved)
@@ -927,6 +932,8 @@ def load_checkpoint(args: Args) -> dict[str, Any] | None:
 
 def check_same(args: Args, saved: dict[str, Any]) -> None:
     """Raise RunError unless the run was begun with these arguments, or can be extended to them."""
+    if (version := saved.get("version", 1)) != VERSION:
+        raise RunError(f"{args.path} was run by version {version} of this file, now {VERSION}")
     longer = args.extend and args.total_timesteps > saved["args"]["total_timesteps"]
     for name, value in saved["args"].items():
         now = getattr(args, name, None)
@@ -1007,6 +1014,7 @@ def train(args: Args) -> Learner:
 
         for env in envs:
             env.close()
+        writer.flush()
         save_checkpoint(args, learner)
 
     writer.close()
