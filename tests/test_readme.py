@@ -19,6 +19,9 @@ def test_its_code_runs(code):
     if "loss" in names:
         names["loss"].backward()
         assert names["policy"].weight.grad.abs().sum() > 0
+    elif "row" in names:
+        assert 0 <= names["row"]["conditioning/psi"] <= 1
+        assert names["regularizer"].coefficient == 1e-2
     else:
         assert names["info"]["clean_obs"].shape == names["obs"].shape
 
