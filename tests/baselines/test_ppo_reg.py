@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import math
+import runpy
 import signal
 import sys
 import types
@@ -265,7 +267,10 @@ def test_every_epoch_takes_each_state_once(
     data = Rollout(
         obs[..., None], obs[..., None] + 0.5, obs, 0 * obs, 0 * obs, 0 * obs, None, [], [], None
     )
-    ppo_reg.update(args, learner, data)
+    logs = ppo_reg.update(args, learner, data)
+    # what is logged is a mean over the minibatches: log-std begins at 0.5 and moves by little
+    entropy = 0.5 * math.log(2 * math.pi * math.e) + 0.5
+    assert logs["losses/entropy"] == pytest.approx(entropy, abs=0.1)
     of_policy = sum(x is learner.actor_optimizer for x in optimizers)
     assert (of_policy, len(optimizers) - of_policy) == steps
     epochs = np.reshape(taken, (-1, 16)).tolist()
@@ -946,12 +951,12 @@ def test_no_global_random_state_is_touched(tmp_path):
 # --- the program ---------------------------------------------------------------------------------
 
 
-def run_main(monkeypatch, *flags: str) -> None:
+def run_main(monkeypatch, *flags: str, main=ppo_reg.main) -> None:
     monkeypatch.setattr("sys.argv", ["ppo_reg.py", *flags])
     monkeypatch.setattr("sys.stdout.reconfigure", lambda **options: None, raising=False)
     kept = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
-        ppo_reg.main()
+        main()
     finally:
         for number, handler in kept.items():
             signal.signal(number, handler)
@@ -971,6 +976,17 @@ SHORT = ["--env-id=Pendulum-v1", "--num-steps=64", "--num-minibatches=4", "--tot
 def test_an_error_ends_the_program_with_what_to_do(tmp_path, monkeypatch, flags, message):
     with pytest.raises(SystemExit, match=message):
         run_main(monkeypatch, *flags, f"--run-dir={tmp_path}")
+
+
+def test_the_file_is_a_program_whose_help_shows_every_flag(monkeypatch, capsys):
+    run_file = functools.partial(runpy.run_path, ppo_reg.__file__, run_name="__main__")
+    with pytest.raises(SystemExit) as stopped:
+        run_main(monkeypatch, "--help", main=run_file)
+    said = capsys.readouterr().out
+    assert stopped.value.code == 0
+    assert all(f"--{name.replace('_', '-')}" in said for name in vars(Args()))
+    assert "PPO (Schulman et al., 2017" in said
+    assert "# condwrap" not in said
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -1024,8 +1040,11 @@ def test_a_run_that_diverges_says_so_and_keeps_its_last_checkpoint(tmp_path, bro
     with np.errstate(invalid="ignore"), pytest.raises(DivergedError, match=f"the {what} became"):
         train(args)
     said = json.loads((tmp_path / "diverged.json").read_text())
-    assert said["update"] == 4
-    assert said["what"] == what
+    assert said == {
+        "update": 4,
+        "what": what,
+        "message": f"the {what} became non-finite in update 4",
+    }
     assert len(read_metrics(tmp_path)) == 3
     saved = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
     assert saved["learner"]["update"] == 2
