@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import json
 import math
+import os
 import runpy
 import signal
 import sys
@@ -865,6 +866,31 @@ def test_a_checkpoint_is_written_at_each_interval_and_the_one_before_is_kept(tmp
     assert state["obs_rms"]["count"].item() == learner.stats["obs_rms"].count
     assert state["obs_rms"]["var"].dtype == torch.float64
     assert set(state["generators"]) == {"init", "action", "minibatch"}
+
+
+def test_a_checkpoint_is_on_the_disk_before_it_takes_its_name(tmp_path, monkeypatch):
+    events = []
+
+    def fsync(number: int) -> None:
+        inode = os.fstat(number).st_ino
+        name = next(path.name for path in tmp_path.iterdir() if path.stat().st_ino == inode)
+        events.append(f"write {name}")
+
+    def replace(path: Path, target: Path) -> None:
+        events.append(f"rename {path.name} to {target.name}")
+        os.rename(path, target)
+
+    args = pendulum(ppo_reg, tmp_path)
+    learner = train(args)
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(Path, "replace", replace)
+    ppo_reg.save_checkpoint(args, learner)
+    assert events == [
+        "write metrics.csv",
+        "write checkpoint.tmp",
+        "rename checkpoint.pt to checkpoint.previous.pt",
+        "rename checkpoint.tmp to checkpoint.pt",
+    ]
 
 
 def test_a_torn_checkpoint_falls_back_on_the_one_before(tmp_path, capsys):
