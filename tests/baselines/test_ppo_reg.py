@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import json
 import math
 import os
@@ -960,12 +961,21 @@ def test_tensorboard_holds_what_metrics_csv_holds_after_a_resume(tmp_path, monke
     assert "|gamma|0.99|" in text
 
 
-def test_progress_is_told_at_the_start_and_the_end(tmp_path, capsys):
-    train(pendulum(ppo_reg, tmp_path))
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[1] for line in lines] == ["1/5", "5/5"]
-    assert all("steps/s" in line and "return" in line for line in lines)
-    assert all(float(row["charts/SPS"]) > 0 for row in read_metrics(tmp_path))
+def test_speed_and_progress_by_a_clock_of_a_second_an_update(tmp_path, monkeypatch, capsys):
+    """16 steps a second, told at once, whenever more than 10 seconds have passed, and at the end.
+
+    A resumed run counts from where it went on.
+    """
+    settings = {"num_steps": 16, "checkpoint_interval": 10, "update_epochs": 1, "vf_epochs": 1}
+    for updates, told in ((30, ["1/30", "12/30", "23/30", "30/30"]), (32, ["31/32", "32/32"])):
+        clock = types.SimpleNamespace(monotonic=itertools.count().__next__)
+        monkeypatch.setattr(ppo_reg, "time", clock)
+        settings |= {"total_timesteps": 16 * updates, "resume": True, "extend": updates > 30}
+        train(pendulum(ppo_reg, tmp_path, **settings))
+        lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+        assert [words[1] for words in lines] == told
+        assert {" ".join(words[2:5]) for words in lines} == {"16 steps/s return"}
+    assert {float(row["charts/SPS"]) for row in read_metrics(tmp_path)} == {16.0}
 
 
 def test_no_global_random_state_is_touched(tmp_path):
