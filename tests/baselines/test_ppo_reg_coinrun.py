@@ -288,12 +288,25 @@ def test_resets_reach_no_loss_and_no_log():
         assert not data.counts.all()
         for column in (data.rewards, data.values, data.logprobs):
             column[~data.counts] += spoiled
+        data.obs[~data.counts] += int(spoiled > 0) * 100
         learner.update = 25  # so that the gradient share is due
         logs.append(update(args, learner, data))
         learners.append(learner)
     assert torch.equal(*[flat(learner.agent) for learner in learners])
     assert logs[0] == logs[1]
     assert 0 < logs[0]["conditioning/gradient_share"] < 1
+
+
+def test_each_rollout_has_masks_of_its_own(tmp_path):
+    args = coinrun(tmp_path, dropout=0.5, total_timesteps=128)
+    learner = train(args)
+    again = Learner(args)
+    masks = []
+    for _ in range(2):
+        again.draw_masks()
+        masks.append(again.agent.network[-1].mask.clone())
+    assert not torch.equal(*masks)
+    assert torch.equal(learner.agent.network[-1].mask, masks[1])
 
 
 # --- the loss ------------------------------------------------------------------------------------
