@@ -281,7 +281,7 @@ def test_resets_reach_no_loss_and_no_log():
     learners = []
     logs = []
     for spoiled in (0.0, 1e6):
-        changes = {"num_minibatches": 1, "anneal": False}
+        changes = {"num_minibatches": 1, "anneal": False, "probe_fraction": 1.0}
         args = make_args(num_envs=2, num_groups=1, num_steps=12, **changes)
         learner, envs = Learner(args), scripted([3, 2], [4, 1])
         data = rollout(args, learner, envs, [envs[0].reset()[0]])
@@ -864,6 +864,21 @@ def test_any_number_of_groups_trains(tmp_path, num_groups):
     train(coinrun(tmp_path, num_envs=4, num_groups=num_groups, num_steps=16, total_timesteps=128))
     rows = read_metrics(tmp_path)
     assert [int(row["global_step"]) for row in rows] == [64, 128]
+
+
+def test_environments_are_rebuilt_with_other_seeds_at_each_checkpoint(tmp_path, monkeypatch):
+    seeds = []
+    reset = ppo_reg_coinrun.Procgen.reset
+
+    def spy(env, seed):
+        seeds.append(seed)
+        return reset(env, seed=seed)
+
+    monkeypatch.setattr(ppo_reg_coinrun.Procgen, "reset", spy)
+    args = coinrun(tmp_path, checkpoint_interval=2)
+    train(args)
+    assert seeds == [ppo_reg_coinrun.env_seeds(args, checkpoint)[0] for checkpoint in range(3)]
+    assert len(set(seeds)) == 3
 
 
 def test_groups_play_different_levels():
