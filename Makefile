@@ -7,9 +7,7 @@ INSTALLED := .venv/installed
 # What `make mutate` changes, and how many changes to a module it draws; 0: all, which takes hours.
 MODULES ?= $(wildcard condwrap/[a-z]*.py) baselines/ppo_reg.py baselines/trpo_reg.py \
 	harness/suite.py harness/store.py harness/report/table1.py harness/report/table2.py \
-	$(firstword $(wildcard harness/statistics harness/statistics.py)) \
-	$(firstword $(wildcard harness/report/claims harness/report/claims.py)) \
-	$(firstword $(wildcard harness/evaluation harness/evaluate.py))
+	harness/statistics harness/report/claims harness/evaluation
 SAMPLE ?= 60
 
 .PHONY: help run test tests slow check bench mutate lock clean

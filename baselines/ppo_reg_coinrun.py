@@ -742,7 +742,7 @@ def update(args: Args, learner: Learner, data: Rollout) -> dict[str, float]:
     def plain_loss() -> Tensor:  # condwrap
         return total_loss(args, learner, clip_coef, *[x[:size] for x in columns])[0]  # condwrap
 
-    about = (agent.logprobs, data.states, plain_loss, agent.parameters())  # condwrap
+    about = (agent.logprobs, columns[0], plain_loss, agent.parameters())  # condwrap
     share = learner.probe.gradient_share(learner.update, *about)  # condwrap
 
     logs: list[Tensor] = []
@@ -843,6 +843,7 @@ def open_logs(args: Args, saved: dict[str, Any] | None) -> SummaryWriter:
         if metrics.tell() < size:
             raise RunError(f"{metrics.name} lacks rows: remove its folder to start again")
         metrics.truncate(size)  # later rows are computed again
+    (args.path / "diverged.json").unlink(missing_ok=True)  # and may now stay finite
 
     first = saved["learner"]["global_step"] if saved else 0
     writer = SummaryWriter(str(args.path), purge_step=first + 1)

@@ -645,6 +645,7 @@ def open_logs(args: Args, saved: dict[str, Any] | None) -> SummaryWriter:
         if metrics.tell() < size:
             raise RunError(f"{metrics.name} lacks rows: remove its folder to start again")
         metrics.truncate(size)  # later rows are computed again
+    (args.path / "diverged.json").unlink(missing_ok=True)  # and may now stay finite
 
     first = saved["learner"]["update"] if saved else 0
     writer = SummaryWriter(str(args.path), purge_step=first * args.batch_size + 1)

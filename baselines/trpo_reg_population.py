@@ -203,10 +203,12 @@ def line_search(
 
 
 def gradient_share(learner: Any, *batch: Tensor) -> dict[str, float]:  # condwrap
-    """As the single file measures it, on the learner's own actor."""  # condwrap
     obs, actions, advantages = batch  # condwrap
-    columns = (obs, actions, learner.actor(obs).log_prob(actions), advantages)  # condwrap
-    plain = functools.partial(trpo_reg.surrogate, learner, *columns)  # condwrap
+
+    def plain() -> Tensor:  # condwrap
+        logprobs = learner.actor(obs).log_prob(actions).detach()  # condwrap
+        return trpo_reg.surrogate(learner, obs, actions, logprobs, advantages)  # condwrap
+
     with torch.enable_grad():  # condwrap
         return learner.probe.gradient_share(learner.update, learner.actor, obs, plain)  # condwrap
 

@@ -16,6 +16,15 @@ from condwrap.spectrum import jacobian_singular_values
 
 SHARE_INTERVAL = 25  # updates between two measurements of the gradient share
 
+# what makes J and psi in the paper: the yardstick
+PAPER: dict[str, Any] = {
+    "lambda_min": 1.0,
+    "lambda_max": 20.0,
+    "reduction": "sample",
+    "perturbation": "sphere",
+    "radius": 1.0,
+}
+
 
 class ConditioningProbe:
     """Measures a policy while it is trained, without a trace in it or in the training's noise.
@@ -56,7 +65,7 @@ class ConditioningProbe:
         action_bounds: tuple[Any, Any] | None = None,
     ) -> None:
         generator = torch.Generator(device).manual_seed(seed)
-        self.yardstick = ConditioningRegularizer(coefficient=0.0, generator=generator)
+        self.yardstick = ConditioningRegularizer(0.0, **PAPER, generator=generator)
         self.own = own
         self.own_is_paper = own_is_paper
         self.fraction = fraction
@@ -76,7 +85,8 @@ class ConditioningProbe:
             `psi`, quantiles of J, the mean of J² and the fractions below and above the range by the
             yardstick; the same as `own_*` by the run's own settings; with `action_bounds`
             `quotient_executed`, the median J of the executed action; with `log_spectrum` the
-            singular values. What is not due is NaN, so that each update has the same names.
+            singular values. What is not due is NaN, so that each update has the same names. With
+            `reduction="batch"` the own J is one for all the observations, not for a minibatch.
         """
         states = take_evenly(obs, self.fraction)
         delta = self.yardstick.sample_delta(states)

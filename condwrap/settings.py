@@ -7,19 +7,10 @@ from typing import Any, Literal
 
 import torch
 
-from condwrap.probe import ConditioningProbe
+from condwrap.probe import PAPER, ConditioningProbe
 from condwrap.regularizer import ConditioningRegularizer
 
 Device = torch.device | str
-
-# what makes J and psi: the paper's settings, and the library's defaults
-PAPER = {
-    "lambda_min": 1.0,
-    "lambda_max": 20.0,
-    "reduction": "sample",
-    "perturbation": "sphere",
-    "radius": 1.0,
-}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).parents[1]  # the checkout
+ROOT = Path(__file__).resolve().parents[1]  # the checkout
 CODE = ("condwrap", "baselines", "harness")  # folders whose content decides a run's numbers
 PACKAGES = {"PyTorch": "torch", "NumPy": "numpy", "Gymnasium": "gymnasium", "pybullet": "pybullet",
             "EnvPool": "envpool", "condwrap": "condwrap"}  # fmt: skip
@@ -24,9 +24,8 @@ def now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-@functools.cache
 def here() -> dict[str, Any]:
-    """The code, the versions and the machine, as they are now."""
+    """The code, the versions and the machine, as they are now: a commit may come at any time."""
     own = Path(_git("rev-parse", "--show-toplevel") or "/") == ROOT  # not a repository around it
     commit = _git("rev-parse", "HEAD") if own else None
     changed = _git("status", "--porcelain", "--", *CODE)
@@ -165,6 +164,7 @@ def machine_of(session: dict[str, Any]) -> str:
     return name if session["device"] == "cpu" else f"{name}, {session['device']}"
 
 
+@functools.cache
 def _versions() -> dict[str, str]:
     """Of each package that is installed."""
     found = {}

@@ -11,6 +11,7 @@ import pandas as pd
 from harness.statistics.scores import (
     PSI,
     early_psi,
+    last_psi,
     moved_together,
     training_psi,
     training_score,
@@ -37,6 +38,7 @@ def exact_scores(metrics: pd.DataFrame, total_timesteps: int) -> dict[str, float
 
     if PSI in metrics:
         found["psi"] = training_psi(metrics, total_timesteps)
+        found["last_psi"] = last_psi(metrics)
         found["early_psi"] = early_psi(metrics, total_timesteps)
         found["together"] = moved_together(metrics)
     return found

@@ -36,9 +36,9 @@ def cost_claim(results: Results) -> Claim:
     """
     findings = from_runs(results) if results.timed is None else measured_in_turn(results.timed)
     steps = [
-        results.metrics[run.run_id]["global_step"].iloc[-1]
+        results.scores[run.run_id]["steps"]
         for run in results.suite.runs
-        if run.run_id in results.done
+        if run.run_id in results.done and run.run_id in results.scores
     ]
     verdict = agreed([finding.verdict for finding in findings]) if findings else UNDECIDED
     basis = basis_of(steps, paper_numbers("table1")["timesteps"])
@@ -100,6 +100,8 @@ def step_times(results: Results) -> pd.DataFrame:
     rows = []
     for run in results.suite.runs:
         if run.algorithm not in arms or run.run_id not in results.done:
+            continue
+        if run.run_id not in results.scores:  # it diverged in its first update
             continue
         plain, arm = arms[run.algorithm]
         session = last_session(results.specs.get(run.run_id, {}))

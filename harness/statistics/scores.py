@@ -42,6 +42,12 @@ def training_psi(metrics: pd.DataFrame, total_timesteps: int) -> float:
     return float(rows[PSI].mean())
 
 
+def last_psi(metrics: pd.DataFrame) -> float:
+    """The last finite psi: that of a run whose own numbers became non-finite; NaN for none."""
+    finite = metrics.loc[np.isfinite(metrics[PSI]), PSI]
+    return float(finite.iloc[-1]) if len(finite) else np.nan
+
+
 def early_psi(metrics: pd.DataFrame, total_timesteps: int) -> float:
     """Mean psi over the first tenth of the steps; of the first update where that ends later."""
     finite = metrics[np.isfinite(metrics[PSI])]

@@ -88,7 +88,7 @@ class Ours:
         data = ours.rollout(self.args, self.learner, self.envs, self.frames)
         self.learner.update += 1
         losses = ours.update(self.args, self.learner, data)
-        assert all(math.isfinite(x) for x in losses.values())
+        assert math.isfinite(losses["losses/value_loss"])
 
 
 KINDS = {

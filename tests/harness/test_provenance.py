@@ -15,13 +15,6 @@ from harness import provenance
 from harness.provenance import device_of, find_origins, here, implementation_of
 
 
-@pytest.fixture(autouse=True)
-def fresh():
-    here.cache_clear()
-    yield
-    here.cache_clear()
-
-
 def git(*words: object) -> None:
     flags = ["-c", "user.name=x", "-c", "user.email=x@x"]
     subprocess.run(["git", *flags, *map(str, words)], check=True, capture_output=True)
@@ -46,11 +39,9 @@ def test_the_commit_and_whether_code_differs_from_it(checkout):
     assert found["clean"] is True
 
     (checkout / "notes.txt").write_text("not code")
-    here.cache_clear()
     assert here()["clean"] is True
 
     (checkout / "condwrap" / "a.py").write_text("2")
-    here.cache_clear()
     assert here() == {**found, "clean": False}
 
 

@@ -332,12 +332,12 @@ def arms(name: str) -> dict[str, list[dict]]:
 
 def test_the_ablation_has_an_arm_for_each_question():
     found = arms("ablation")
-    assert found["PPO"] == [{"coefficient": 0.0}] * 3
+    assert found["PPO"] == [{"coefficient": 0.0}] * 4
     assert list(load_suite("ablation").sweeps["coefficient"]) == [1e-3, 1e-2, 1e-1, 1.0]
-    assert found["printed sign"] == [{"coefficient": 0.1, "printed_sign": True}] * 3
-    assert found["per batch"] == [{"coefficient": 0.1, "reduction": "batch"}] * 3
-    assert found["PPO, gain 1"] == [{"coefficient": 0.0, "output_gain": 1.0}] * 3
-    assert found["PPO reg, gain 1"] == [{"coefficient": 0.1, "output_gain": 1.0}] * 3
+    assert found["printed sign"] == [{"coefficient": 0.1, "printed_sign": True}] * 4
+    assert found["per batch"] == [{"coefficient": 0.1, "reduction": "batch"}] * 4
+    assert found["PPO, gain 1"] == [{"coefficient": 0.0, "output_gain": 1.0}] * 4
+    assert found["PPO reg, gain 1"] == [{"coefficient": 0.1, "output_gain": 1.0}] * 4
     at_median = found["upper clamp at median J"]
     at_half = found["upper clamp at half of it"]
     assert [arm["lambda_min"] for arm in (*at_median, *at_half)] == [0.0] * 6

@@ -53,7 +53,7 @@ def _row(run: RunSpec, results: Results) -> dict[str, Any]:
         "reward": np.nan if failed else scores.get("training_score", np.nan),
         "final": final_score(episodes) if played else np.nan,
         "final_sampled": final_score(episodes, "sampled") if played else np.nan,
-        "psi": scores.get("psi", np.nan),
+        "psi": scores.get("last_psi" if failed else "psi", np.nan),
         "early_psi": scores.get("early_psi", np.nan),
         "together": scores.get("together", np.nan),
     }
