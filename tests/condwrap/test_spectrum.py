@@ -304,6 +304,51 @@ def test_where_it_has_converged_the_gradient_is_that_of_the_exact_one(m, n):
     torch.testing.assert_close(got, exact)
 
 
+def test_twenty_iterations_are_the_default():
+    """Singular values of 1 and 0.99 are far from told apart, so each iteration shows."""
+    policy, obs = with_jacobians(torch.diag(torch.tensor([1.0, 0.99])).double()[None])
+    default = largest_singular_value(policy, obs)
+    assert default == largest_singular_value(policy, obs, iterations=20)
+    assert default < largest_singular_value(policy, obs, iterations=21)
+
+
+def test_the_direction_is_held_fixed_in_the_gradient():
+    """J = diag(w): of ‖J v‖ with v held, the gradient is w v² / ‖J v‖, converged or not."""
+    w = torch.tensor([2.0, 1.0], dtype=torch.float64, requires_grad=True)
+    obs = torch.zeros(1, 2, dtype=torch.float64)
+    first = torch.Generator().manual_seed(0)
+    v = torch.randn(1, 2, generator=first, dtype=torch.float64)
+    v = v * w.detach() ** 2
+    v = v / v.norm()
+    largest = largest_singular_value(lambda x: x * w, obs, iterations=1)
+    (gradient,) = torch.autograd.grad(largest.sum(), w)
+    length = (w * v).norm().item()
+    assert largest.item() == pytest.approx(length)
+    expected = (w.detach() * v**2).flatten() / length
+    torch.testing.assert_close(gradient, expected)
+
+
+@pytest.mark.parametrize(
+    ("m", "n", "dtype", "by_gram_matrix"),
+    [
+        (3, 5, torch.float32, False),
+        (5, 3, torch.float32, False),
+        (3, 6, torch.float32, True),
+        (6, 3, torch.float32, True),
+        (3, 9, torch.float64, False),
+    ],
+)
+def test_the_gram_matrix_serves_where_the_jacobian_is_long(
+    monkeypatch, m, n, dtype, by_gram_matrix
+):
+    calls = []
+    eigvalsh = torch.linalg.eigvalsh
+    monkeypatch.setattr(torch.linalg, "eigvalsh", lambda x: calls.append(x) or eigvalsh(x))
+    policy, obs = with_jacobians(torch.randn(2, m, n, dtype=dtype))
+    jacobian_singular_values(policy, obs)
+    assert [x.shape for x in calls] == ([(2, 3, 3)] if by_gram_matrix else [])
+
+
 def test_a_jacobian_too_large_to_be_held_is_measured():
     diagonal = torch.linspace(0.0, 1.0, 200_000)  # its Jacobian would take 160 GB
     diagonal[7] = 2.0

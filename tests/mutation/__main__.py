@@ -39,6 +39,7 @@ PYTEST = ["-x", "-q", "-p", "no:cacheprovider", "-W", "ignore::pytest.PytestAsse
 ALSO = {  # tests of a module beside the file that mirrors it
     "condwrap/estimators.py": ["tests/condwrap/test_known_output.py"],
     "condwrap/policy.py": ["tests/condwrap/test_known_output.py"],
+    "condwrap/regularizer.py": ["tests/condwrap/test_known_output.py"],
 }
 
 

@@ -102,12 +102,16 @@ def find_changes(node: cst.CSTNode, told: bool = False) -> Iterator[Change]:
 
 
 def make_mutants(source: str) -> dict[str, str]:
-    """All mutants of a module: a line that says what changes, and the module's text."""
+    """All mutants of a module: a line that says what changes, and the module's text.
+
+    A change to a line that occurs several times is numbered from the second on.
+    """
     module = MetadataWrapper(cst.parse_module(source)).module
     mutants: dict[str, str] = {}
     for node, changed in find_changes(module):
         text = module.deep_replace(node, changed).code
         lines = difflib.ndiff(source.splitlines(), text.splitlines())
         name = " ".join(f"{line[0]} {line[2:].strip()}" for line in lines if line[0] in "+-")
-        mutants[name] = text
+        alike = sum(other.startswith(name) for other in mutants)
+        mutants[f"{name} ({alike + 1})" if alike else name] = text
     return mutants

@@ -37,3 +37,8 @@ def test_the_changes_to_a_line(before, after):
 def test_a_change_is_named_by_its_line_and_keeps_the_comments():
     mutants = make_mutants("# why\nx = 1  # condwrap\n")
     assert mutants == {"- x = 1  # condwrap + x = 2  # condwrap": "# why\nx = 2  # condwrap\n"}
+
+
+def test_the_same_change_in_two_places_counts_twice():
+    mutants = make_mutants("if a:\n    f()\nif b:\n    f()\n")
+    assert list(mutants)[1:] == ["- f() + pass", "- if b: + if not (b):", "- f() + pass (2)"]
