@@ -153,6 +153,26 @@ def test_the_penalty_is_added_to_the_actor_loss():
     assert (penalized - plain).item() == pytest.approx(3.0 * 0.25, rel=1e-5)
 
 
+def test_the_penalty_is_taken_at_the_delta_that_is_given():
+    """Where delta is 0 so is J, whatever the slope: psi is 0.25, and no noise is drawn."""
+    args = Args(coefficient=3.0, lambda_min=0.5)
+    learner = fixed_learner(args)
+    batch = (torch.ones(2, 1), torch.ones(2, 1), torch.zeros(2), torch.tensor([1.0, 2.0]))
+    state = learner.regularizer.generator.get_state()
+    plain, _ = actor_loss(args, learner, *batch)
+    penalized, _ = actor_loss(args, learner, *batch, torch.zeros(2, 1))
+    assert (penalized - plain).item() == pytest.approx(3.0 * 0.25, rel=1e-5)
+    assert torch.equal(learner.regularizer.generator.get_state(), state)
+
+
+def test_the_loss_is_compiled_where_asked(monkeypatch):
+    monkeypatch.setattr(torch, "compile", lambda function: (function, "compiled"))
+    args = Args(env_id="Pendulum-v1")
+    assert ppo_reg.Learner(args).actor_loss is actor_loss
+    compiled = ppo_reg.Learner(dataclasses.replace(args, compile=True))
+    assert compiled.actor_loss == (actor_loss, "compiled")
+
+
 def test_one_update_by_hand():
     """One step of plain gradient descent on one minibatch, against float64 written out here."""
     settings = {"update_epochs": 1, "vf_epochs": 1, "ent_coef": 0.2, "vf_coef": 0.7}
@@ -916,6 +936,19 @@ def test_a_run_is_overwritten_by_no_other(tmp_path, monkeypatch):
     (tmp_path / "metrics.csv").unlink()
     with pytest.raises(RunError, match="holds a run"):
         train(pendulum(ppo_reg, tmp_path, **INTERVAL_2))
+
+
+@pytest.mark.parametrize(("version", "named"), [(None, 1), (99, 99)])
+def test_a_run_of_another_version_is_not_continued(tmp_path, version, named):
+    """The first version wrote no number."""
+    train(pendulum(ppo_reg, tmp_path))
+    path = tmp_path / "checkpoint.pt"
+    saved = torch.load(path, weights_only=True)
+    assert saved.pop("version") == ppo_reg.VERSION
+    torch.save(saved if version is None else {**saved, "version": version}, path)
+    message = f"run by version {named} of this file, now {ppo_reg.VERSION}$"
+    with pytest.raises(RunError, match=message):
+        train(pendulum(ppo_reg, tmp_path, resume=True))
 
 
 def test_a_malicious_checkpoint_is_not_executed(tmp_path):

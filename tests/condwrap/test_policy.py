@@ -78,6 +78,12 @@ def test_output_keeps_every_batch_axis():
     assert flat_output(torch.ones(2, 4, 3, 5), "default", torch.Size([2, 4])).shape == (2, 4, 15)
 
 
+def test_tensors_are_joined_behind_every_batch_axis():
+    pair = (torch.zeros(2, 4, 3), torch.ones(2, 4))
+    joined = flat_output(pair, "default", torch.Size([2, 4]))
+    assert joined.tolist() == [[[0.0, 0.0, 0.0, 1.0]] * 4] * 2
+
+
 class Unreadable:
     pass
 
