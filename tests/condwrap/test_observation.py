@@ -54,6 +54,27 @@ def test_autocast_widens_half_precision_alone():
     assert widened == [torch.float32, torch.float32, *dtypes[2:]]
 
 
+def test_floating_leaves_are_perturbed_as_they_are():
+    x = torch.ones(4, 2, dtype=torch.float64)
+    states = read(x)
+    assert states.perturbed[0] is x
+    assert states.device == x.device
+
+
+def test_the_default_device_plays_no_part():
+    x = torch.arange(6.0)[:, None]
+    with torch.device("meta"):
+        assert read(x).subset(0.5).tensors[0].flatten().tolist() == [0.0, 2.0, 4.0]
+
+
+def test_chunks_hold_all_states_in_order():
+    obs = {"x": torch.arange(5.0)[:, None], "mode": torch.arange(5)}
+    chunks = read(obs).chunks(2)
+    assert [chunk.tensors[0].flatten().tolist() for chunk in chunks] == [[0, 1], [2, 3], [4]]
+    assert [chunk.tensors[1].tolist() for chunk in chunks] == [[0, 1], [2, 3], [4]]
+    assert chunks[2].sizes == [1]
+
+
 def test_states_cannot_be_changed():
     states = read(torch.ones(4, 2))
     with pytest.raises(dataclasses.FrozenInstanceError):
@@ -166,6 +187,11 @@ def test_a_percentage_of_100_states_is_that_many_states(percent):
         ({}, TypeError, "obs must be floating or uint8, got no tensor"),
         (torch.ones(4, 2, dtype=torch.int64), TypeError, "pass obs_scale=<the divisor>"),
         (torch.ones(4, dtype=torch.bool), TypeError, "got torch.bool"),
+        (
+            {"a": torch.ones(4).long(), "b": torch.ones(4).bool()},
+            TypeError,
+            "got torch.int64, torch.bool:",
+        ),
         (torch.ones(()), ValueError, "batch_ndim=1 leading axes that its leaves share"),
         (
             {"a": torch.ones(4, 2), "b": torch.ones(3, 2)},
@@ -202,6 +228,13 @@ def test_two_batch_axes_are_checked():
 def test_flatten_refuses(delta, error, message):
     with pytest.raises(error, match=re.escape(message)):
         read(torch.ones(4, 3)).flatten(delta)
+
+
+def test_flatten_refuses_an_integer_part_beside_a_floating_one():
+    states = read({"a": torch.ones(4, 3), "b": torch.ones(4, 3)})
+    message = re.escape("delta must be floating, got ['torch.float32', 'torch.int64']")
+    with pytest.raises(TypeError, match=message):
+        states.flatten({"a": torch.ones(4, 3), "b": torch.ones(4, 3).long()})
 
 
 @pytest.mark.parametrize("delta", [{"a": torch.ones(4, 3)}, torch.ones(4, 3)])
