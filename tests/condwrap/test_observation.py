@@ -221,7 +221,7 @@ def test_two_batch_axes_are_checked():
         (torch.ones(4, 2), ValueError, "leaves of shape [(4, 3)], got [(4, 2)]"),
         (torch.ones(3, 3), ValueError, "sample_delta(obs) draws one that does"),
         ({"x": torch.ones(4, 3), "y": torch.ones(4, 3)}, ValueError, "delta must match"),
-        (np.ones((4, 3)), ValueError, "delta must match"),
+        (np.ones((4, 3)), ValueError, "leaves of shape [(4, 3)], got ['ndarray']"),
         (torch.ones(4, 3, dtype=torch.int64), TypeError, "delta must be floating"),
     ],
 )

@@ -177,6 +177,18 @@ def test_without_a_seed_the_stream_continues():
         np.testing.assert_allclose(delta.flatten(), noise / np.linalg.norm(noise))
 
 
+def test_the_environment_is_given_the_options_of_a_reset():
+    given = []
+
+    class Listening(Random):
+        def reset(self, *, seed=None, options=None):
+            given.append(options)
+            return super().reset(seed=seed)
+
+    PerturbObservation(Listening(SPACES["vector"])).reset(seed=1, options={"level": 3})
+    assert given == [{"level": 3}]
+
+
 def test_two_environments_never_seeded_differ():
     deltas = [obs - info["clean_obs"] for obs, info in (perturbed("float64").reset() for _ in "ab")]
     assert not same(*deltas)
