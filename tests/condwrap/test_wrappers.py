@@ -137,6 +137,17 @@ def test_a_dict_shares_one_delta_and_other_leaves_pass():
         np.testing.assert_allclose(obs["vector"], vector.clip(-0.5, 0.5), rtol=1e-6)
 
 
+def test_three_boxes_take_their_parts_in_order():
+    names = ("a", "b", "c")
+    boxes = [spaces.Box(-9, 9, (n,), np.float64) for n in (1, 2, 3)]
+    env = Random(spaces.Dict(dict(zip(names, boxes, strict=True))))
+    shown, info = PerturbObservation(env, perturbation=lambda x: np.arange(6.0) / 6).reset(seed=0)
+    expected = {"a": [0], "b": [1, 2], "c": [3, 4, 5]}
+    for name in names:
+        moved = info["clean_obs"][name] + np.array(expected[name]) / 6
+        np.testing.assert_allclose(shown[name], moved.clip(-9, 9))
+
+
 @every_space
 def test_the_environments_own_trajectory_is_not_changed(space):
     plain = episode(Random(SPACES[space]), seed=5, steps=20)
@@ -345,6 +356,18 @@ def test_clean_observations_are_those_of_the_unwrapped_vector(space, mode):
         for i, shown, before in final_rows(SPACES[space], info):
             assert same(before, expected_info["final_obs"][i])
             assert not same(shown, before)
+
+
+def test_what_else_is_said_of_a_final_step_is_kept():
+    mode = AutoresetMode.SAME_STEP
+    wrapped = drive(VectorPerturbObservation(sync("vector", mode)), mode)
+    plain = drive(sync("vector", mode), mode)
+    kept = [(info, own) for (_, info, _), (_, own, _) in zip(wrapped, plain, strict=True)]
+    kept = [(info["final_info"], own["final_info"]) for info, own in kept if "final_info" in own]
+    assert kept
+    for final_info, own in kept:
+        assert own.keys() >= {"left", "_left"}
+        assert same({name: final_info[name] for name in own}, own)
 
 
 def test_final_observations_without_further_infos_are_perturbed_too():
