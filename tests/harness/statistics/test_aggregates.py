@@ -81,3 +81,13 @@ def test_the_interval_is_wide_for_few_agents():
 @pytest.mark.parametrize("pairs", [[], [pair([], [])]])
 def test_without_agents_there_is_no_chance(pairs):
     np.testing.assert_equal(probability_of_improvement(pairs), (np.nan, np.nan, np.nan, 0))
+
+
+def test_the_seed_decides_the_resamples():
+    values = np.random.default_rng(3).normal(size=12)
+    for of, data in (
+        (interquartile_mean, [values]),
+        (probability_of_improvement, [(values, -values)]),
+    ):
+        assert of(data) == of(data, seed=0)
+        assert of(data) != of(data, seed=1)

@@ -132,3 +132,36 @@ def test_the_place_among_the_permutations_is_scipys():
         ).pvalue  # fmt: skip
         assert getattr(found, name) == pytest.approx(expected)
     assert found.deviation == pytest.approx(1 / np.sqrt(4))  # 1 / sqrt(n - 1)
+
+
+def test_data_sets_have_each_their_place():
+    rng = np.random.default_rng(8)
+    x, y = rng.normal(size=(2, 3, 2, 6))
+    sums, settings = permuted_correlations(x, y)
+    many = summarize(sums, settings)
+    for i in range(3):
+        single = summarize(*permuted_correlations(x[i], y[i]))
+        for several, one in zip(many, single, strict=True):
+            assert several[i] == pytest.approx(one)
+
+
+def test_where_no_setting_tells_there_is_no_place():
+    found = summarize(*permuted_correlations(np.ones((2, 5)), np.ones((2, 5))))
+    assert np.isnan(found).all()
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_jackknife_by_hand(sign):
+    """Four agents; without one of them the correlation of the three is 0.5, 0.5, 1 and 1."""
+    x, y = np.array([[1.0, 2.0, 3.0, 4.0]]), sign * np.array([[1.0, 2.0, 4.0, 3.0]])
+    without = [stats.spearmanr(np.delete(x, i), np.delete(y, i)).statistic for i in range(4)]
+    assert without == pytest.approx([sign * 0.5, sign * 0.5, sign, sign])
+    # variance 1 / 16, times 3; the interval ends at 1 or -1, where the correlation does
+    reach = stats.t.ppf(0.975, 3) * np.sqrt(3 / 16)
+    expected = sorted([sign, sign * (0.8 - reach)])
+    np.testing.assert_allclose(rank_correlation(x, y), (sign * 0.8, *expected, 4))
+
+
+def test_three_agents_have_a_correlation_and_no_interval():
+    x = np.array([[1.0, 2.0, 3.0]])
+    np.testing.assert_allclose(rank_correlation(x, x[:, ::-1]), (-1.0, np.nan, np.nan, 3))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -63,12 +65,45 @@ def test_arms_are_judged_together():
     assert not is_skewed([without])
     assert is_skewed([without, with_one])
     assert not is_skewed([without, without + 1000.0])  # arms differ, agents do not
+    assert not is_skewed([without, without, without, without + 1000.0])
     assert not is_skewed([np.full(5, 2.0), np.empty(0)])
 
 
-def test_the_same_values_give_the_same_interval():
+def test_the_interval_is_that_of_all_resamples():
+    """Five values have 5^5 resamples: their studentized means, one by one."""
+    values = np.array([1.0, 2.5, 3.0, 4.5, 7.0])
+    picked = values[np.array(list(itertools.product(range(5), repeat=5)))]
+    errors = np.array([stats.sem(row) for row in picked])
+    scaled = (picked.mean(axis=1) - values.mean())[errors > 0] / errors[errors > 0]
+    below, above = np.percentile(scaled, (2.5, 97.5))
+    expected = values.mean() - np.array([above, below]) * stats.sem(values)
+    _, low, high, _ = estimate_mean(values)
+    assert (low, high) == pytest.approx(tuple(expected), rel=0.03)
+
+
+def test_resamples_without_spread_do_not_count():
+    """A twelfth of the resamples are all 0: they have no standard error to be measured in."""
+    mean, low, high, _ = estimate_mean(np.array([0.0, 0.0, 0.0, 1.0, 1.0]))
+    assert low < mean < high
+
+
+def test_skewness_has_a_limit_either_way():
+    # of 0, 1 with a share p of ones the third standardized moment is (1 - 2p) / sqrt(p (1 - p))
+    half, more = np.repeat([0.0, 1.0], [7, 3]), np.repeat([0.0, 1.0], [8, 2])  # 0.87 and 1.5
+    assert [is_skewed([half]), is_skewed([-half])] == [False, False]
+    assert [is_skewed([more]), is_skewed([-more])] == [True, True]
+
+
+def test_thirty_skewed_values_have_an_interval_and_29_have_none():
+    values = np.random.default_rng(7).exponential(size=30)
+    assert np.isnan(estimate_mean(values[:29], skewed=True).low)
+    assert np.isfinite(estimate_mean(values, skewed=True).low)
+
+
+def test_the_seed_decides_the_resamples():
     values = np.random.default_rng(4).normal(size=12)
-    assert estimate_mean(values) == estimate_mean(values)
+    assert estimate_mean(values) == estimate_mean(values, seed=0)
+    assert estimate_mean(values) != estimate_mean(values, seed=1)
 
 
 def test_intervals_of_rows_are_students():

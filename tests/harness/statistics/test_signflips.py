@@ -78,6 +78,7 @@ def test_missing_pairs_do_not_count():
     assert sign_flip_test(holes) == pytest.approx(sign_flip_test(there))
     np.testing.assert_allclose(sign_flip_interval(holes), sign_flip_interval(there))
     assert np.isnan(sign_flip_test(np.full(4, np.nan)))
+    assert np.isnan(sign_flip_test(np.stack([there, there * np.nan]))).tolist() == [False, True]
     assert np.isnan(sign_flip_interval(np.full(4, np.nan))).all()
 
 
@@ -146,3 +147,20 @@ def test_at_a_level_that_all_signs_must_reach_the_effect_is_the_binomials():
 @pytest.mark.parametrize(("n", "share"), [(1, 1.0), (5, 1.0), (9, 1 / 16)])
 def test_too_few_pairs_could_have_found_nothing(n, share):
     assert np.isnan(detectable_difference(1.0, n, share))
+
+
+@pytest.mark.parametrize("n", [6, 10])
+def test_the_smallest_p_of_n_pairs_is_found(n):
+    """At a level of exactly 2 / 2^n all n signs must agree: P(d > 0) = 0.8^(1/n)."""
+    share = 2.0 ** (1 - n) / ALPHA
+    expected = stats.norm.ppf(0.8 ** (1 / n))
+    assert detectable_difference(1.0, n, share) == pytest.approx(expected, rel=0.05)
+    assert np.isnan(detectable_difference(1.0, n, 0.999 * share))
+
+
+def test_the_p_value_of_small_numbers_is_that_of_large_ones():
+    """Sums of equal differences differ in their last bits alone, whatever the unit."""
+    differences = np.array([0.1, 0.2, -0.3, 0.1, 0.2, 0.3])
+    expected = sign_flip_test(np.array([1.0, 2.0, -3.0, 1.0, 2.0, 3.0]))
+    for unit in (1e-12, 1.0, 1e12):
+        assert sign_flip_test(unit * differences) == expected

@@ -138,3 +138,17 @@ def test_data_sets_do_not_mix():
     np.testing.assert_allclose(
         [values[2, 1] for values in compare_success(many)], compare_success(many[2, 1])
     )
+
+
+def test_the_variance_by_hand():
+    """Five runs on two levels: what differs between runs, between levels, and is left."""
+    rates = np.array([[0.5, 0.1], [0.7, 0.5], [0.9, 0.7], [0.6, 0.0], [0.8, 0.2]])
+    means = [0.3, 0.6, 0.8, 0.3, 0.5]  # of the runs; of the levels 0.7 and 0.3
+    # each run's first level less its mean and less 0.2, the level's: the second is its opposite
+    left = np.array([0.2, 0.1, 0.1, 0.3, 0.3]) - 0.2
+    noise = 2 * (left**2).sum() / ((5 - 1) * (2 - 1))
+    variance = np.var(means, ddof=1) / 5 + np.var([0.7, 0.3], ddof=1) / 2 - noise / (5 * 2)
+    found = compare_success(rates)
+    assert found.mean == pytest.approx(0.5)
+    assert found.high - found.mean == pytest.approx(stats.t.ppf(0.975, 4) * np.sqrt(variance))
+    assert found.mean - found.low == pytest.approx(found.high - found.mean)
