@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from harness.statistics import holm, sign_flip_test
+from harness.statistics import detectable_difference, holm, sign_flip_test
 from harness.statistics.judgements import associate, compare_arms
 
 RNG = np.random.default_rng(0)
@@ -164,3 +165,43 @@ def test_what_could_have_been_found_is_a_correlation():
     # deviation 1 / sqrt(9), z(1 - 0.05 * 0.8 / 2) + z(0.8) = 2.05 + 0.84
     assert few.headline.detectable == pytest.approx([2.9 / 3] * 2, rel=0.05)
     assert (many.headline.detectable < 0.35).all()
+
+
+def test_what_could_have_been_found_has_its_share_of_the_level():
+    """Two contrasts of three tasks: a headline has half of the level, a task a sixth."""
+    first, second = PAIRS.copy()
+    second[1, 2] = np.nan  # so that five tasks have a test
+    found = compare_arms(first, second)
+    for contrast in range(2):
+        for task in range(2):
+            spread = (second - first)[contrast, task].std(ddof=1)
+            expected = detectable_difference(spread, 10, 1 / 5)
+            assert found.tasks.detectable[contrast, task] == pytest.approx(expected)
+    assert np.isnan(found.tasks.detectable[1, 2])
+    # all agents have all tasks: each has its mean over the tasks
+    for contrast, tasks in ((0, 3), (1, 2)):
+        spread = found.standard[contrast, :tasks].mean(axis=0).std(ddof=1)
+        expected = detectable_difference(spread, 10, 1 / 2)
+        assert found.headline.detectable[contrast] == pytest.approx(expected)
+
+
+def test_no_p_value_of_a_correlation_is_above_1():
+    """Two agents: the data are below both permutations, and above one of two."""
+    score = np.arange(2.0)[None]
+    found = associate(np.stack([score, score]), score, np.array([0]))
+    assert found.headline.p.tolist() == [1.0, 1.0]
+    assert found.headline.word.tolist() == [0, 0]
+
+
+def test_a_correlation_is_of_all_its_agents_and_settings_that_are_flat_have_none():
+    score = np.random.default_rng(8).normal(size=(2, 9))
+    psi = np.stack([score, score])
+    psi[:, 1] = 3.0
+    found = associate(psi, score, np.array([0, 1]))
+    assert found.tasks.n.tolist() == [[9, 0], [9, 0]]
+    assert np.isnan(found.tasks.p).tolist() == [[False, True], [False, True]]
+    assert found.headline.mean == pytest.approx([1.0, 1.0])
+    # one test is left beside the headlines: 4 tasks share the level, 2 of them not made
+    share = 0.05 * 0.8 / 2
+    reach = stats.norm.ppf(1 - share) + stats.norm.ppf(0.8)
+    assert found.tasks.detectable[:, 0] == pytest.approx([reach / np.sqrt(8)] * 2, rel=0.05)

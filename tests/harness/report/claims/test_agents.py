@@ -31,6 +31,19 @@ def test_an_agent_is_a_row_with_its_early_and_late_numbers(store, suite):
     assert (row["done"], row["failed"]) == (True, False)
 
 
+def test_the_changes_of_psi_and_reward_are_correlated(store, suite):
+    # changes 1, 3, 2 of reward and 5, 1, 2 of psi: d = 2, 2, 0, so 1 - 6 * 8 / 24
+    write_run(store, suite.runs[0], [0.0, 1.0, 4.0, 6.0], [0.0, 5.0, 6.0, 8.0])
+    assert table(suite, store)["together"] == pytest.approx(-1.0)
+
+
+def test_agents_that_have_not_begun_have_no_row(store, suite):
+    write_run(store, suite.runs[5], [1.0, 2.0], done=False)
+    row = table(suite, store)
+    assert (row["environment"], row["seed"], row["agent"]) == ("Reacher", 1, 1)
+    assert (row["done"], row["failed"], row["updates"]) == (False, False, 2)
+
+
 def test_the_final_policy_is_beside(store, suite):
     episodes = make_control_episodes([1.0, 3.0], [5.0])
     write_run(store, suite.runs[0], [0.0], episodes=episodes)

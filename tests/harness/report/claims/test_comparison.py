@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from harness.report.claims import Claim, Finding, agent_table, make_claims
-from harness.report.claims.comparison import make_arms
+from harness.report.claims.comparison import comparison_claim, make_arms
 from harness.report.results import load_results
 from tests.harness.conftest import write_run
 
@@ -37,6 +38,13 @@ def shifted(by: dict[str, float], better: str = "PPO reg"):
         return 100.0 * (agent % 10) + gain
 
     return reward
+
+
+def deviation_of_both() -> float:
+    """Of the scores of both arms, where PPO reg gains `UP`."""
+    plain = [100.0 * i for i in range(10)]
+    gained = [100.0 * i + UP + 5 * (1 + i % 7) * SIGNS[i] for i in range(10)]
+    return float(np.std(plain + gained, ddof=1))
 
 
 @pytest.mark.parametrize(
@@ -83,6 +91,7 @@ def test_half_of_the_tasks_within_half_a_deviation_are_not_enough(study):
     claim = claim_of(study(shifted(gains), tasks=tuple(gains)))
     assert found(claim, "reward", "Hopper").verdict == "negligible"
     assert claim.verdict == "supported"
+    assert claim.notes[0] == "PPO reg - PPO: 1 wins and 0 losses on 2 tasks."  # not on most
 
 
 def test_both_contrasts_must_agree(study):
@@ -157,6 +166,23 @@ def test_standard_differences_are_in_deviations_of_both_arms(study):
     assert headline(claim_of(results)).estimate.mean == pytest.approx(2.0 / deviation)
 
 
+def test_a_task_in_deviations_is_the_same_finding_in_another_unit(study):
+    claim = claim_of(study(shifted(dict.fromkeys(TASKS, UP)), tasks=TASKS))
+    for task in TASKS:
+        raw = found(claim, "PPO reg - PPO: reward", task)
+        standard = found(claim, "PPO reg - PPO: in standard deviations", task)
+        scaled = np.array(raw.estimate[:3]) / deviation_of_both()
+        assert standard.estimate[:3] == pytest.approx(tuple(scaled))
+        assert standard.detectable == pytest.approx(raw.detectable / deviation_of_both())
+        for name in ("p", "p_holm", "verdict", "note", "failed"):
+            assert getattr(standard, name) == getattr(raw, name)
+        assert standard.estimate.n == raw.estimate.n == 10
+        assert raw.p < raw.p_holm  # of four tests
+    assert headline(claim).p == pytest.approx(2 / 1024)
+    # the headline has four fifths of the level, and what it is decided leaves the rest
+    assert headline(claim).p_holm == pytest.approx(2 / 1024 / 0.8)
+
+
 def test_equal_rewards_are_no_difference(study):
     claim = claim_of(study(lambda *_: 5.0))
     assert found(claim, "reward", "Hopper").estimate == (0.0, 0.0, 0.0, 10)
@@ -172,6 +198,16 @@ def test_middle_and_chance_stand_beside_without_a_verdict(study):
         assert finding.estimate.n == 30
         assert np.isnan(finding.p)
     # 900 on top is beaten only by the plain agents above; ten by ten agents meet
+    middle = stats.trim_mean(
+        np.concatenate(
+            [
+                np.array([UP + 5 * (1 + i % 7) * SIGNS[i] for i in range(10)]) / deviation_of_both()
+                for _ in TASKS
+            ]
+        ),
+        0.25,
+    )
+    assert found(claim_of(results), "interquartile").estimate.mean == pytest.approx(middle)
     chance = np.mean(
         [
             np.heaviside(100 * i + UP + 5 * (1 + i % 7) * SIGNS[i] - 100 * j, 0.5)
@@ -278,3 +314,56 @@ def test_a_contrast_that_has_not_run_leaves_the_claim_open(study):
     assert claim.verdict == "undecided"
     assert headline(claim).verdict == "supported"
     assert "No pairs yet: TRPO reg - TRPO." in claim.notes
+
+
+def test_two_contrasts_take_a_pair_more_than_one(study):
+    results = study(shifted({"Hopper": UP}), algorithms=FOUR, agents=6)
+    for contrast in ("PPO reg - PPO", "TRPO reg - TRPO"):
+        assert headline(claim_of(results), contrast).note == "7 pairs could decide"
+        assert found(claim_of(results), f"{contrast}: reward", "Hopper").note.startswith("7 pairs")
+
+
+PLANNED = {(task, name) for task in TASKS for name in ("PPO", "PPO reg")}
+
+
+@pytest.mark.parametrize(
+    ("planned", "verdict", "ending"),
+    [
+        (PLANNED - {("Ant", "PPO reg"), ("Reacher", "PPO reg")}, "supported", "on most tasks."),
+        (PLANNED - {("Ant", "PPO"), ("Reacher", "PPO reg")}, "supported", "on most tasks."),
+        (PLANNED - {("Ant", "PPO")}, "undecided", "Not yet run: Reacher."),
+        (PLANNED, "undecided", "Not yet run: Ant, Reacher."),
+    ],
+)
+def test_only_tasks_that_both_arms_plan_are_missing(study, planned, verdict, ending):
+    agents = agent_table(study(shifted({"Hopper": UP})))
+    claim = comparison_claim(agents, "b", planned)
+    assert claim.verdict == verdict
+    assert claim.notes[0].endswith(ending)
+
+
+@pytest.mark.parametrize(
+    ("planned", "open_"), [({"TRPO"}, False), ({"TRPO reg"}, False), ({"TRPO", "TRPO reg"}, True)]
+)
+def test_only_contrasts_that_both_arms_plan_are_open(study, planned, open_):
+    agents = agent_table(study(shifted({"Hopper": UP})))
+    more = {("Hopper", name) for name in planned}
+    claim = comparison_claim(agents, "b", {("Hopper", "PPO"), ("Hopper", "PPO reg")} | more)
+    assert ("No pairs yet: TRPO reg - TRPO." in claim.notes) == open_
+    assert claim.verdict == ("undecided" if open_ else "supported")
+
+
+def test_failures_are_counted_where_they_happened(study):
+    """On Ant one agent of PPO and two of PPO reg fail; none of TRPO."""
+    lost = {("Ant", "PPO", 1), ("Ant", "PPO reg", 1), ("Ant", "PPO reg", 4)}
+    win = shifted({"Hopper": UP, "Ant": UP})
+    claim = claim_of(
+        study(win, algorithms=FOUR, tasks=("Hopper", "Ant"), diverged=lambda *key: key in lost)
+    )
+    assert claim.failed == 3
+    for about in ("reward", "in standard deviations"):
+        failed = [found(claim, f"PPO reg - PPO: {about}", t).failed for t in ("Hopper", "Ant")]
+        assert failed == [0, 3]
+    for about in ("in standard deviations", "interquartile", "probability"):
+        contrasts = ("PPO reg - PPO", "TRPO reg - TRPO")
+        assert [found(claim, f"{c}: {about}").failed for c in contrasts] == [3, 0]

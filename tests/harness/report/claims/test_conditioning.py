@@ -42,6 +42,13 @@ def test_it_is_supported_where_better_agents_have_smaller_psi(study):
             np.testing.assert_allclose(found(claim, about, task).estimate, (-1, -1, -1, 10))
             assert found(claim, about, task).verdict == "supported"
     assert claim.basis == "at 0.08% of the paper's length (4,000 steps)"
+    assert list(dict.fromkeys(f.about for f in claim.findings)) == [
+        "over agents: final psi and reward",
+        "over agents: early psi and reward",
+        "over training: changes of psi and reward",
+    ]
+    assert (claim.failed, claim.without_failed) == (0, "")
+    assert claim.notes == ("Changes over training are reported; they are no part of the verdict.",)
 
 
 def test_it_is_contradicted_where_they_have_larger_psi(study):
@@ -102,6 +109,8 @@ def test_the_verdict_is_of_all_tasks_not_of_the_single_ones(study):
     headline = found(claim, "final psi")
     singles = [found(claim, "final psi", task) for task in TASKS]
     assert headline.estimate.mean == pytest.approx(np.mean([f.estimate.mean for f in singles]))
+    expected = [stats.spearmanr(range(10), orders[task]).statistic for task in TASKS]
+    assert [f.estimate.mean for f in singles] == pytest.approx(expected)
     assert headline.p_holm < min(f.p_holm for f in singles)
     assert claim.verdict == headline.verdict == "supported"
 
@@ -127,11 +136,12 @@ def test_agents_whose_psi_was_moved_by_design_do_not_count(study, other):
 
 
 def test_agents_that_a_setting_lacks_are_left_out_of_all(study):
-    missing = ("Hopper", "TRPO", 3)
+    missing = [("Hopper", "TRPO", 3), ("Hopper", "PPO", 5)]
     results = study(
-        lambda *key: None if key == missing else learns(*key), falls, algorithms=["PPO", "TRPO"]
+        lambda *key: None if key in missing else learns(*key), falls, algorithms=["PPO", "TRPO"]
     )
-    assert found(claim_of(results), "final psi").estimate.n == 9
+    finding = found(claim_of(results), "final psi")
+    assert (finding.estimate.n, finding.estimate.mean) == (8, pytest.approx(-1.0))
 
 
 def test_unfinished_agents_do_not_count(study):
@@ -163,6 +173,8 @@ def test_changes_over_training_are_reported_and_not_judged(study):
     finding = found(claim, "over training")
     assert finding.estimate.mean == pytest.approx(-1.0)
     assert finding.verdict == "reported"
+    assert finding.p == pytest.approx(2 / 1024)
+    assert finding.estimate.n == 10
     assert claim.verdict == "undecided"  # psi is the same for all
 
 
@@ -188,7 +200,29 @@ def test_a_failed_agent_has_the_worst_score_and_is_counted(study):
 
 def test_means_of_settings_are_there_to_be_drawn(study):
     results = study(lambda _, name, __: 1.0 * len(name), lambda *key: 2.0 * key[2],
-                    algorithms=["PPO", "TRPO", "PPO reg"], updates=4)  # fmt: skip
+                    algorithms=["TRPO", "PPO", "PPO reg"], updates=4)  # fmt: skip
     means = setting_means(agent_table(results)).set_index("algorithm")
+    assert list(means.index) == ["TRPO", "PPO"]  # as the suite has them
     assert means["reward"].to_dict() == {"PPO": 3.0, "TRPO": 4.0}
     assert means.loc["PPO", "psi"] == 9.0
+
+
+def test_a_task_has_its_own_failures(study):
+    claim = claim_of(
+        study(
+            learns, falls, algorithms=["PPO", "TRPO"], tasks=("Hopper", "Ant"),
+            diverged=lambda task, _, agent: (task, agent) == ("Ant", 2),
+        )
+    )  # fmt: skip
+    for about in ("final psi", "early psi", "over training"):
+        failed = [found(claim, about, task).failed for task in ("all", "Hopper", "Ant")]
+        assert failed == [2, 0, 2]
+
+
+def test_three_agents_are_enough_for_a_correlation_and_two_are_not(study):
+    def three(task, _, agent):
+        return None if agent >= {"Hopper": 3, "Ant": 2}[task] else agent + RISING
+
+    claim = claim_of(study(three, falls, algorithms=["PPO"], tasks=("Hopper", "Ant")))
+    assert {f.task for f in claim.findings if "final psi" in f.about} == {"all", "Hopper"}
+    assert found(claim, "final psi").estimate.n == 3

@@ -8,6 +8,8 @@ import pytest
 
 from harness.report.claims import generalization_claim
 from harness.report.results import load_results
+from harness.schema import SUITES
+from harness.statistics import compare_success
 from harness.suite import load_suite
 from tests.harness.conftest import make_episodes, write_run
 
@@ -135,7 +137,63 @@ def test_greedy_episodes_do_not_move_the_claim(store):
 
 
 def test_the_basis_is_the_papers_fifty_million_steps(store):
-    assert claim_of(store, gain).basis == "at 0.0002% of the paper's length (100 steps)"
+    suite = load_suite("table2")
+    for run in suite.runs[:2]:
+        write_run(store, run, [0.0, 0.0, 0.0], episodes=episodes(PLAIN, PLAIN))
+    claim = generalization_claim(load_results(suite, store))
+    assert claim.basis == "at 0.0006% of the paper's length (300 steps)"
+
+
+def test_a_finding_is_the_test_of_its_column(store):
+    """Each of eight columns has an eighth of the level."""
+    claim = claim_of(store, lambda seed: (gain(seed), seed % 3), seeds=6)
+    wins = np.arange(1, 7)
+    for finding, reg in zip(claim.findings[:2], (2 + wins % 2, wins % 3), strict=True):
+        gains = np.repeat((reg - 1)[:, None] / 4, 4, axis=1)
+        expected = compare_success(gains, share=1 / 8)
+        assert finding.estimate == pytest.approx((*(float(x) for x in expected[:3]), 6))
+        assert finding.p == pytest.approx(float(expected.p))
+        assert finding.detectable == pytest.approx(float(expected.detectable))
+
+
+def test_levels_that_one_of_the_runs_lacks_are_left_out(store):
+    """Of the plain agents' levels 0 and 1 the regularized ones have played 0."""
+    suite = load_suite("table2")
+    for run in suite.runs:
+        found = [[1, 1]] if run.algorithm.endswith(" reg") else [[0, 1], [0, 0]]
+        write_run(store, run, [0.0], episodes=episodes(found, found))
+    claim = generalization_claim(load_results(suite, store))
+    assert {f.estimate.mean for f in claim.findings} == {0.5}
+
+
+def test_failures_are_counted_for_each_pair_of_agents(store):
+    suite = load_suite("table2", seeds=2)
+    lost = {("PPO", 1), ("PPO reg", 1), ("PPO reg", 2), ("PPO-IMP", 2)}
+    for run in suite.runs:
+        write_run(
+            store, run, [0.0], episodes=episodes(PLAIN, PLAIN),
+            diverged=(run.algorithm, run.args["seed"]) in lost,
+        )  # fmt: skip
+    claim = generalization_claim(load_results(suite, store))
+    failed = {f.task: f.failed for f in claim.findings if f.note != "no pair yet"}
+    expected = {"PPO": 3, "PPO-l2": 0, "PPO-D": 0, "PPO-IMP": 1}
+    assert failed == {task: expected[task] for task in failed}
+    assert {"PPO-l2", "PPO-IMP"} <= set(failed)
+
+
+def test_agents_of_two_games_are_apart(store, tmp_path):
+    path = tmp_path / "games.toml"
+    text = (SUITES / "table2.toml").read_text()
+    assert 'CoinRun = "coinrun"' in text
+    path.write_text(text.replace('CoinRun = "coinrun"', 'CoinRun = "coinrun"\nMaze = "maze"'))
+    suite = load_suite(str(path))
+    for run in suite.runs:
+        won = BETTER if (run.environment, run.algorithm) == ("Maze", "PPO-D reg") else PLAIN
+        write_run(store, run, [0.0], episodes=episodes(won, won))
+    claim = generalization_claim(load_results(suite, store))
+    gains = {f.task: f.estimate.mean for f in claim.findings}
+    assert len(claim.findings) == 2 * 4 * 2
+    assert {task for task, mean in gains.items() if mean} == {"Maze: PPO-D"}
 
 
 def test_unseen_themes_are_a_column_of_the_claim(store):
