@@ -302,6 +302,50 @@ def test_figure1_is_four_settings_of_plain_ppo_on_four_tasks():
     assert "ours" in next(iter(suite.figures))  # the worse settings are not the paper's
 
 
+def test_figure1s_worse_settings_are_those_of_docs_paper_md():
+    expected = {
+        "PPO": {},
+        "PPO setting 2": {"gae_lambda": 0.5, "gamma": 0.95},
+        "PPO setting 3": {"vf_learning_rate": 1e-5, "vf_epochs": 1},
+        "PPO setting 4": {"gae_lambda": 0.0, "gamma": 0.8, "vf_learning_rate": 1e-2},
+    }
+    found = arms("figure1")
+    assert list(found) == list(expected)
+    for name, settings in expected.items():
+        assert found[name] == [{"coefficient": 0.0, **settings}] * 4 * 3  # tasks, seeds
+    assert "(2) λ 0.5, γ 0.95; (3) critic's step size 1e-5, 1 epoch; (4) λ 0, γ 0.8, critic's" in (
+        SUITES.parents[1] / "docs" / "paper.md"
+    ).read_text(encoding="utf-8")
+
+
+def test_table1_is_the_standard_settings():
+    assert arms("table1") == {
+        name: [{"coefficient": 0.0} if name in ("PPO", "TRPO") else {}] * 8 * 3
+        for name in ("PPO", "PPO reg", "TRPO", "TRPO reg")
+    }
+    counts = Counter((run.args["seed"], run.args["agent"]) for run in load_suite("table1").runs)
+    assert counts == dict.fromkeys([(s, a) for s in (1, 2, 3) for a in range(10)], 4 * 8)
+
+
+def test_strong_is_rl_baselines3_zoos_tuning():
+    """Of its ppo.yml and trpo.yml: minibatches of 128, and what is said in the suite's comments."""
+    suite = load_suite("strong")
+    assert {run.args["total_timesteps"] for run in suite.runs} == {2_000_000}
+    found = arms("strong")
+    ppo = {
+        "num_envs": 16, "num_steps": 512, "num_minibatches": 16 * 512 // 128, "update_epochs": 20,
+        "vf_epochs": 20, "learning_rate": 3e-5, "vf_learning_rate": 3e-5, "gae_lambda": 0.9,
+        "clip_coef": 0.4, "hidden_sizes": [256, 256], "activation": "relu",
+    }  # fmt: skip
+    trpo = {
+        "num_envs": 2, "num_steps": 1024, "num_minibatches": 2 * 1024 // 128, "cg_steps": 25,
+        "vf_epochs": 20, "vf_learning_rate": 1e-3,
+    }  # fmt: skip
+    for name, settings in (("PPO", ppo), ("TRPO", trpo)):
+        assert found[f"{name} reg"] == [settings] * 8 * 3
+        assert found[name] == [{"coefficient": 0.0, **settings}] * 8 * 3
+
+
 def test_smoke_holds_trpo_and_the_settings_of_figure_1():
     smoke, figure1 = load_suite("smoke"), load_suite("figure1")
     assert {"TRPO", "TRPO reg"} <= set(smoke.algorithms)
