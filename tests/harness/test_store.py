@@ -332,6 +332,14 @@ def test_a_longer_run_keeps_the_shorter_one_as_it_was(store, suite):
     assert store.was_extended(long)
 
 
+def test_a_run_without_an_evaluation_is_extended_too(store, suite):
+    short, long = suite.runs[0], suite.runs[0].with_args(total_timesteps=400)
+    write_run(store, short, [1.0, 2.0])
+    store.start(long, [], [long])
+    assert [store.state(short), store.state(long)] == ["done", "interrupted"]
+    assert not store.path(short, "evaluation-200.csv").exists()
+
+
 def test_a_run_that_starts_again_at_its_length_keeps_what_it_has(store, suite):
     spec = dataclasses.replace(suite.runs[0], evaluation={"levels": 1, "repeats": 1})
     write_run(store, spec, [1.0], episodes=make_episodes(seen_sampled=[[1.0]]))

@@ -37,6 +37,9 @@ PRELOAD = ("torch._dynamo", "gymnasium.vector", "hypothesis", "jax.numpy", "tyro
            "matplotlib.pyplot", "scipy.stats", "torch.utils.tensorboard")  # fmt: skip
 PYTEST = ["-x", "-q", "-p", "no:cacheprovider", "-W", "ignore::pytest.PytestAssertRewriteWarning"]
 ALSO = {  # tests of a module beside the file that mirrors it
+    "baselines/trpo_reg.py": [
+        "tests/baselines/test_shared.py"
+    ],  # what is ppo_reg's is tested there
     "condwrap/estimators.py": ["tests/condwrap/test_known_output.py"],
     "condwrap/policy.py": ["tests/condwrap/test_known_output.py"],
     "condwrap/regularizer.py": ["tests/condwrap/test_known_output.py"],
