@@ -6,7 +6,7 @@ INSTALLED := .venv/installed
 
 # What `make mutate` changes, and how many changes to a module it draws; 0: all, which takes hours.
 MODULES ?= $(wildcard condwrap/[a-z]*.py) baselines/ppo_reg.py baselines/trpo_reg.py \
-	harness/suite.py harness/store.py harness/report/table1.py harness/report/table2.py \
+	harness/suite.py harness/store.py harness/report/tables/table1.py harness/report/tables/table2.py \
 	harness/statistics harness/report/claims harness/evaluation
 SAMPLE ?= 60
 
@@ -15,9 +15,9 @@ SAMPLE ?= 60
 help:  ## what each target does
 	@sed -n 's/^\([a-z]*\):.*##/\1\t/p' Makefile | expand -t 10
 
-run: $(INSTALLED)  ## the main job: every agent of the paper at toy length, then the report
-	$(BIN)/python -m harness run-all --suite smoke
-	@echo "Look at results/smoke/report/report.html"
+run: $(INSTALLED)  ## the main job: a first comparison, every agent at toy length, one page of both
+	$(BIN)/python -m harness run-all --suite first smoke
+	@echo "Look at results/report/report.html"
 
 test: $(INSTALLED)  ## the default tests, in minutes
 	$(BIN)/python -m pytest --numprocesses=auto --cov=condwrap --cov-fail-under=100

@@ -33,12 +33,14 @@ from harness.show import (
     say,
     show_costs,
     show_others,
+    show_outcome,
+    show_verdicts,
 )
 from harness.store import STATES, EvaluationError, Store, StoreError
-from harness.suite import load_suite
+from harness.suite import RunSpec, Suite, load_suite, load_suites
 
 app = tyro.extras.SubcommandApp()
-DEFAULT_SUITE = "smoke"
+DEFAULT_SUITES = ("first", "smoke")
 RESULTS = Path("results")
 ARCHIVES = Path("docs/results")
 ERRORS = (  # what a person can mend, each with a sentence that says how
@@ -53,7 +55,7 @@ ERRORS = (  # what a person can mend, each with a sentence that says how
 
 @app.command(name="run-all")
 def run_all(
-    suite: str = DEFAULT_SUITE,
+    suite: tuple[str, ...] = DEFAULT_SUITES,
     jobs: int | None = None,
     results_dir: Path = RESULTS,
     archives: Path = ARCHIVES,
@@ -65,13 +67,14 @@ def run_all(
     plain: bool = False,
     dry_run: bool = False,
 ) -> None:
-    """Run what a suite still lacks, side by side, then report it.
+    """Run what the suites still lack, side by side, then report them on one page.
 
     A finished run is never run again; an interrupted one continues from its last checkpoint.
     Ctrl-C stops the runs and keeps their checkpoints: the same command continues.
 
     Args:
-        suite: Name of a suite (see `list`), or path of a TOML file.
+        suite: Names of suites (see `list`), or paths of TOML files. Several make one page, with a
+            part for each in this order.
         jobs: Runs at a time, one core each; by default all cores.
         results_dir: Where the runs' folders and the reports go.
         archives: Where archives of finished runs are: what they hold is not run again.
@@ -92,40 +95,49 @@ def run_all(
     if extend and total_timesteps is None:
         raise SuiteError("--extend needs --total-timesteps: the length to continue the runs to")
     store = Store(results_dir, archives)
-    plan = load_suite(suite, total_timesteps=total_timesteps, seeds=seeds, agents=agents, env=env)
-    for spec in plan.runs:
+    plans = load_suites(suite, total_timesteps=total_timesteps, seeds=seeds, agents=agents, env=env)
+    runs = _distinct(plans.values())
+    for spec in runs:
         if extend:
             refuse_extension(spec, store)
         else:
             store.refuse_changed(spec)
-    todo = [spec for spec in plan.runs if not store.is_done(spec)]
+    todo = [spec for spec in runs if not store.is_done(spec)]
     groups = make_groups(todo, store, jobs, plain)
-    done = len(plan.runs) - len(todo)
-    say(
-        f"[bold]{plan.name}[/]: {plan.title}. {len(plan.runs)} runs, {plan.timesteps:,} steps; "
-        f"{done} done before, {len(todo)} to do, {jobs} at a time."
-    )
+    for plan in plans.values():
+        say(f"[bold]{plan.name}[/]: {plan.title}. {len(plan.runs)} runs, {plan.timesteps:,} steps.")
+    say(f"{len(runs) - len(todo)} done before, {len(todo)} to do, {jobs} at a time.")
     if dry_run:
         if todo:
             show_costs(measure(groups, jobs, console), jobs)
         return
+
     outcome = Outcome()
     if todo:
         members = [spec for group in groups for spec in group]  # those that share a run's process
         with Progress(console, store, members) as progress:
             outcome = run_local(groups, store, jobs, progress)
-    own = load_suite(suite, total_timesteps=total_timesteps)
-    runs = {run.run_id: run for run in [*own.runs, *plan.runs]}  # seeds beyond the suite's too
-    whole = load_results(dataclasses.replace(own, runs=list(runs.values())), store)
-    make_report(whole, store)
-    show_others(whole)
-    if outcome.held:
-        say(f"[yellow]{len(outcome.held)} runs are being run by another process.[/]")
-    for spec in outcome.failed:
-        say(f"\n[red bold]FAILED[/] {spec.run_id}: {store.path(spec, 'log.txt')} ends")
-        say(store.log_tail(spec), markup=False)
+
+    suites = [_whole(name, plan, total_timesteps) for name, plan in plans.items()]
+    found = [load_results(one, store) for one in suites]
+    report = make_report(found, store)
+    show_others(found)
+    show_outcome(outcome, store)
+    show_verdicts(report)
     if outcome.failed:
         raise SystemExit(1)
+
+
+def _distinct(plans: Iterable[Suite]) -> list[RunSpec]:
+    """The runs of all suites, each once: what a suite includes may be asked for as well."""
+    return list({(run.suite, run.run_id): run for plan in plans for run in plan.runs}.values())
+
+
+def _whole(name: str, plan: Suite, total_timesteps: int | None) -> Suite:
+    """The whole suite, of which a plan may be a part, and the plan's seeds beyond its own."""
+    own = load_suite(name, total_timesteps=total_timesteps)
+    runs = {run.run_id: run for run in [*own.runs, *plan.runs]}
+    return dataclasses.replace(own, runs=list(runs.values()))
 
 
 @app.command(name="list")
@@ -256,24 +268,25 @@ def archive(
 
 @app.command(name="report")
 def report(
-    suite: str = DEFAULT_SUITE,
+    suite: tuple[str, ...] = DEFAULT_SUITES,
     results_dir: Path = RESULTS,
     archives: Path = ARCHIVES,
     total_timesteps: int | None = None,
     seeds: int | None = None,
 ) -> None:
-    """Report what a suite's runs show so far, beside the paper's tables.
+    """Report what the runs of suites show so far, beside the paper's tables.
 
     Args:
-        suite: Name of a suite (see `list`), or path of a TOML file.
+        suite: Names of suites (see `list`), or paths of TOML files. Several make one page, with a
+            part for each in this order.
         results_dir: Where the runs' folders are and the report goes.
         archives: Where archives of finished runs are.
         total_timesteps: The runs of so many steps each, as in `run-all`.
         seeds: So many seeds, as in `run-all`: the suite's first, then those that follow its last.
     """
     store = Store(results_dir, archives)
-    plan = load_suite(suite, total_timesteps=total_timesteps, seeds=seeds)
-    make_report(load_results(plan, store), store)
+    plans = load_suites(suite, total_timesteps=total_timesteps, seeds=seeds)
+    show_verdicts(make_report([load_results(plan, store) for plan in plans.values()], store))
 
 
 @app.command(name="cost")

@@ -16,17 +16,20 @@ LIVE_INTERVAL = 0.5
 
 
 class Progress:
-    """Runs done, environment steps, steps/s and time left, over all runs of a plan.
+    """Runs done, environment steps, steps/s and time left, over all runs of one or more suites.
 
     Steps are read from the runs' own metrics.csv, so they grow by an update at a time.
     """
 
     def __init__(self, console: Console, store: Store, specs: list[RunSpec]) -> None:
         self.console, self.store, self.specs = console, store, specs
-        self.steps = {spec.run_id: store.steps(spec) for spec in specs}
+        self.steps = {_key(spec): store.steps(spec) for spec in specs}
         self.total = sum(spec.args["total_timesteps"] for spec in specs)
-        self.first, self.started = sum(self.steps.values()), time.monotonic()
-        self.ended_runs, self.shown = 0, 0.0
+        self.first = sum(self.steps.values())
+        self.started = time.monotonic()
+        self.ended_runs = 0
+        self.shown = 0.0
+        self.several = len({spec.suite for spec in specs}) > 1
         self.bar = rich.progress.Progress(
             rich.progress.TextColumn("{task.description}"),
             rich.progress.BarColumn(),
@@ -55,8 +58,9 @@ class Progress:
         """Say that a run is over."""
         self.ended_runs += 1
         done = self.store.is_done(spec)  # whole updates may end short of the total
-        self.steps[spec.run_id] = spec.args["total_timesteps"] if done else self.store.steps(spec)
-        line = f"[{self.ended_runs}/{len(self.specs)}] {spec.run_id}  {how}"
+        self.steps[_key(spec)] = spec.args["total_timesteps"] if done else self.store.steps(spec)
+        name = "/".join(_key(spec)) if self.several else spec.run_id
+        line = f"[{self.ended_runs}/{len(self.specs)}] {name}  {how}"
         self.bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
 
     def update(self, running: list[RunSpec]) -> None:
@@ -66,7 +70,7 @@ class Progress:
         if now - max(self.shown, self.started) < interval:
             return
         self.shown = now
-        self.steps |= {spec.run_id: self.store.steps(spec) for spec in running}
+        self.steps |= {_key(spec): self.store.steps(spec) for spec in running}
         line = self._show()
         if not self.console.is_interactive:
             self.console.print(line, highlight=False, soft_wrap=True)
@@ -78,6 +82,11 @@ class Progress:
         what, speed = f"{self.ended_runs}/{len(self.specs)} runs", f"{rate:,.0f} steps/s, {left}"
         self.bar.update(self.task, completed=done, description=what, speed=speed)
         return f"{what}  {100 * done / self.total:.0f}%  {speed}"
+
+
+def _key(spec: RunSpec) -> tuple[str, str]:
+    """Suite and run id: suites have runs of the same name."""
+    return spec.suite, spec.run_id
 
 
 def duration(seconds: float) -> str:

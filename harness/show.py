@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import functools
 import math
+from pathlib import Path
+from typing import NamedTuple
 
 import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
 from harness.estimate import Cost
+from harness.launchers.local import Outcome
 from harness.progress import duration
 from harness.provenance import cores
-from harness.report.page import write_report
+from harness.report.page import write_page, write_report
+from harness.report.part import Part
 from harness.report.results import Results
 from harness.schema import suite_names
 from harness.statistics import estimate_success, success_matrix
@@ -23,17 +27,57 @@ console = Console()
 say = functools.partial(console.print, highlight=False, soft_wrap=True)
 
 
-def make_report(results: Results, store: Store) -> None:
-    """Print the table and the verdicts, and write the whole report to results/<suite>/report/."""
-    folder = store.report_path(results.suite.name)
-    sections, found = write_report(results, folder)
-    for section in sections:
-        console.print(section.table)
-        for note in section.notes:
-            say(f"• {note}", markup=False)
-    for claim in found:
-        say(f"Claim ({claim.letter}): {claim.statement} [bold]{claim.verdict}[/]")
-    say(f"Written: {folder / 'report.html'}, with its tables and figures beside it.")
+class Report(NamedTuple):
+    """What was written: the parts of the page, one for each suite, and the page."""
+
+    parts: list[Part]
+    page: Path
+
+
+def make_report(found: list[Results], store: Store) -> Report:
+    """Print the tables and write the report of each suite, and one page of several.
+
+    The page of one suite is in results/<suite>/report/, that of several in results/report/.
+    """
+    parts = [write_report(results, store.report_path(results.suite.name)) for results in found]
+    for part in parts:
+        if len(parts) > 1 and part.unjudged:
+            continue  # a table of single agents says that they ran, and the page has it
+        for section in part.sections:
+            if section.table:
+                console.print(section.table)
+                for note in section.notes:
+                    say(f"• {note}", markup=False)
+    if len(parts) == 1:
+        return Report(parts, parts[0].folder / "report.html")
+
+    page = store.report_path() / "report.html"
+    write_page(parts, page)
+    return Report(parts, page)
+
+
+def show_verdicts(report: Report) -> None:
+    """The verdicts, a line each, and where the page is: the last that a command prints."""
+    for part in report.parts:
+        suite = part.results.suite
+        done = f"{len(part.results.done)} of {len(suite.runs)} runs done"
+        failed = f", {len(part.results.diverged)} diverged" if part.results.diverged else ""
+        bases = {claim.basis for claim in part.claims if claim.basis}
+        shared = f", {bases.pop()}" if len(bases) == 1 else ""
+        say(f"\n[bold]{suite.name}[/]: {done}{failed}{shared}. {part.unjudged}")
+        for claim in part.claims:
+            own = "" if shared else f" ({claim.basis})"
+            say(f"({claim.letter}) [bold]{claim.verdict}[/]: {claim.statement}{own}")
+    say(f"\nWritten: {report.page}")
+
+
+def show_outcome(outcome: Outcome, store: Store) -> None:
+    """The runs that another process has, and the log of each that failed."""
+    if outcome.held:
+        say(f"[yellow]{len(outcome.held)} runs are being run by another process.[/]")
+    for spec in outcome.failed:
+        say(f"\n[red bold]FAILED[/] {spec.run_id}: {store.path(spec, 'log.txt')} ends")
+        say(store.log_tail(spec), markup=False)
 
 
 def evaluation_tables(found: dict[str, pd.DataFrame]) -> list[Table]:
@@ -58,15 +102,17 @@ def evaluation_tables(found: dict[str, pd.DataFrame]) -> list[Table]:
     return [table for table in (control, levels) if table.row_count]
 
 
-def show_others(results: Results) -> None:
-    """What the other suites would take here, at the speed that this one's runs have shown."""
+def show_others(found: list[Results]) -> None:
+    """What the other suites would take here, at the speed that these ones' runs have shown."""
     speed = {
         (run.baseline, run.environment): results.metrics[run.run_id]["charts/SPS"].iloc[-1]
+        for results in reversed(found)  # the first one's count
         for run in results.suite.runs
         if run.run_id in results.metrics and "levels" not in run.evaluation  # too short to tell
     }
+    shown = {results.suite.name for results in found}
     for name in suite_names():
-        if name == results.suite.name:
+        if name in shown:
             continue
         other = load_suite(name)
         seconds = sum(

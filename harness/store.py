@@ -49,7 +49,8 @@ class Store:
     def path(self, spec: RunSpec, name: str = "") -> Path:
         return self.root / spec.suite / spec.run_id / name
 
-    def report_path(self, suite: str) -> Path:
+    def report_path(self, suite: str = "") -> Path:
+        """The folder of a suite's report, or of the page of several suites; made if need be."""
         path = self.root / suite / "report"
         path.mkdir(parents=True, exist_ok=True)
         return path

@@ -8,6 +8,7 @@ import hashlib
 import json
 import re
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -158,6 +159,35 @@ def load_suite(
         figures={k: v for part in parts for k, v in part.figures.items()},
         sweeps={k: v for part in parts for k, v in part.sweeps.items()},
     )
+
+
+def load_suites(
+    names: Sequence[str],
+    *,
+    total_timesteps: int | None = None,
+    seeds: int | None = None,
+    agents: int | None = None,
+    env: tuple[str, ...] = (),
+) -> dict[str, Suite]:
+    """Several suites by the names that were given, each scaled as by `load_suite`.
+
+    Each takes those of the environments that it has; a suite that has none of them is left out.
+    """
+    if len(set(names)) < len(names) or not names:
+        raise SuiteError(f"name each suite once, at least one, got {' '.join(names) or 'none'}")
+    known = {name: load_suite(name).environments for name in names}
+    check_known(dict.fromkeys(env), {e for its in known.values() for e in its}, "environment")
+
+    found = {}
+    for name in names:
+        own = tuple(environment for environment in env if environment in known[name])
+        if own or not env:
+            found[name] = load_suite(
+                name, total_timesteps=total_timesteps, seeds=seeds, agents=agents, env=own
+            )
+    if len({suite.name for suite in found.values()}) < len(found):
+        raise SuiteError(f"suites must differ in name, got {' '.join(names)}")
+    return found
 
 
 def _scaled(

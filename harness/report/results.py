@@ -90,7 +90,9 @@ class Results:
     def curves(self, environment: str, algorithm: str, measure: str) -> pd.DataFrame:
         """One measure against environment steps: a row for each step count, a column an agent."""
         found = self.of(environment, algorithm)
-        return pd.DataFrame({k: m.set_index("global_step")[measure] for k, m in found.items()})
+        return pd.DataFrame(
+            {k: m.set_index("global_step")[measure] for k, m in found.items() if measure in m}
+        )
 
 
 def load_results(suite: Suite, store: Store) -> Results:

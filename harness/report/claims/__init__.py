@@ -11,7 +11,7 @@ from harness.report.claims.agents import agent_table
 from harness.report.claims.comparison import comparison_claim
 from harness.report.claims.conditioning import conditioning_claim, setting_means
 from harness.report.claims.finding import Claim, Finding, agreed, to_frame
-from harness.report.claims.generalization import generalization_claim
+from harness.report.claims.generalization import generalization_claim, splits
 from harness.report.results import Results
 
 __all__ = [
@@ -24,6 +24,7 @@ __all__ = [
     "generalization_claim",
     "make_claims",
     "setting_means",
+    "splits",
     "to_frame",
 ]
 

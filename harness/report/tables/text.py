@@ -18,3 +18,20 @@ def supported_by(n: int, failed: int, detectable: float, digits: int = 1) -> str
     """
     effect = "–" if math.isnan(detectable) else f"{detectable:.{digits}f}"
     return f"(n {n}, {failed} failed, finds {effect})"
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number of so many significant digits without an exponent in between; a dash for NaN."""
+    if math.isnan(value):
+        return "–"
+    if value and not 1e-3 <= abs(value) < 1e6:
+        return f"{value:.{digits - 1}e}"
+    text = f"{value:.{digits}g}"
+    return f"{float(text):,.0f}" if "e" in text else text
+
+
+def interval(mean: float, low: float, high: float, digits: int = 3) -> str:
+    """A mean, and its interval in brackets where it has one."""
+    if math.isnan(low):
+        return number(mean, digits)
+    return f"{number(mean, digits)} [{number(low, digits)}, {number(high, digits)}]"

@@ -11,9 +11,9 @@ import pandas as pd
 from rich.table import Table
 
 from harness.report.claims.agents import agent_table, fill_failed
-from harness.report.markdown import supported_by, to_markdown_table
 from harness.report.published import paper_numbers, zoo_numbers
 from harness.report.results import Results
+from harness.report.tables.text import supported_by, to_markdown_table
 from harness.statistics import (
     Estimate,
     detectable_difference,
@@ -80,8 +80,7 @@ def make_cells(results: Results, outcome: str = "reward") -> list[Cell]:
     """
     suite = results.suite
     paper = paper_numbers("table1") if outcome == "reward" else {}
-    named = paper_numbers("table1")
-    algorithms = [name for name in suite.algorithms if name in named] or suite.algorithms
+    algorithms = algorithms_of(suite)
     agents = agent_table(results)
     agents = fill_failed(agents[agents["algorithm"].isin(algorithms)], outcome)
     planned = suite.planned
@@ -115,6 +114,12 @@ def make_cells(results: Results, outcome: str = "reward") -> list[Cell]:
             )
         )
     return cells
+
+
+def algorithms_of(suite: Suite) -> list[str]:
+    """The suite's algorithms that the paper's table has; all of them if it has none."""
+    named = paper_numbers("table1")
+    return [name for name in suite.algorithms if name in named] or suite.algorithms
 
 
 def _window(suite: Suite, environment: str, algorithm: str) -> int:
@@ -266,6 +271,6 @@ def to_rich(results: Results, cells: list[Cell], outcome: str = "reward") -> Tab
             if algorithm and source in ("paper", "zoo"):
                 texts[-1] += f"\n[dim]{source} {text or '–'}[/]"
             else:
-                texts.append(text.replace("[", r"\["))
+                texts.append(text.replace("[", r"\[").replace(" (n ", "\n(n "))
         table.add_row(*texts)
     return table
