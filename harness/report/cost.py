@@ -35,6 +35,9 @@ def cost_claim(results: Results) -> Claim:
     is of the suite's own runs, which must have shared their machine alike to mean anything.
     """
     findings = from_runs(results) if results.timed is None else measured_in_turn(results.timed)
+    how = "the suite's own runs" if results.timed is None else "both arms in turn, alone"
+    named = list(dict.fromkeys(finding.about.rpartition(", ")[2] for finding in findings))
+    notes = (f"Implementations: {', '.join(named)}. Measured on {how}.",) if named else ()
     steps = [
         results.scores[run.run_id]["steps"]
         for run in results.suite.runs
@@ -42,7 +45,7 @@ def cost_claim(results: Results) -> Claim:
     ]
     verdict = agreed([finding.verdict for finding in findings]) if findings else UNDECIDED
     basis = basis_of(steps, paper_numbers("table1")["timesteps"])
-    return Claim("e", STATEMENT, verdict, findings, basis)
+    return Claim("e", STATEMENT, verdict, findings, basis, notes=notes)
 
 
 def measured_in_turn(timed: pd.DataFrame) -> list[Finding]:

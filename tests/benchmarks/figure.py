@@ -16,7 +16,7 @@ mpl.use("agg")
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
-from harness.report.figures import COLORS, save, tidy
+from harness.report.figures.style import COLORS, save, tidy
 from tests.benchmarks.table import pace
 
 MARKERS = "osD^"

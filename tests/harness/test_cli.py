@@ -27,7 +27,8 @@ def small(suite_file, store):
 def test_run_all_runs_reports_and_runs_nothing_twice(run_cli, store, small):
     status, out = run_cli("run-all", *small)
     assert status == 0, out
-    assert "2 runs, 400 steps; 0 done before, 2 to do" in out
+    assert "2 runs, 400 steps." in out
+    assert "0 done before, 2 to do" in out
     assert "106.8" in out
     report = store.root / "tiny" / "report"
     assert {"report.html", "table1.md", "table1.csv", "claims.csv"} <= {
@@ -61,6 +62,69 @@ def test_a_changed_configuration_is_refused_before_anything_starts(run_cli, stor
     assert status == 1
     assert "total_timesteps 200 -> 300" in out
     assert not store.path(suite.runs[1]).exists()
+
+
+@pytest.fixture
+def two_files(suite_file, tmp_path):
+    """Two suites whose runs have the same names: the second has one seed and one agent."""
+    text = suite_file.read_text().replace("seeds = [1, 2]", "seeds = [1]")
+    other = tmp_path / "other.toml"
+    other.write_text(text.replace("agents = 2", "agents = 1").replace("Tiny", "Single"))
+    return [suite_file, other]
+
+
+def test_run_all_of_several_suites_has_one_queue_and_one_page(run_cli, store, two_files):
+    for file in two_files:
+        for spec in load_suite(str(file)).runs:
+            if spec.algorithm == "PPO" or spec.environment == "Reacher":
+                write_run(store, spec, [1.0, float(spec.args["agent"])])
+    words = ["--suite", *two_files, "--results-dir", store.root]
+    status, out = run_cli("run-all", *words, "--seeds", 1, "--env", "Hopper", "--jobs", 2)
+    assert status == 0, out
+    assert "3 done before, 3 to do, 2 at a time" in out
+    assert "[3/3]" in out
+    assert "other/ppo-reg__Hopper__s1__a0  done in" in out
+    assert store.is_done(load_suite(str(two_files[1])).runs[0])
+    for name in ("tiny", "other"):
+        assert (store.root / name / "report" / "report.html").exists()
+    page = (store.root / "report" / "report.html").read_text()
+    assert page.index("<h1>Tiny</h1>") < page.index("<h1>Single</h1>")
+
+
+def test_the_last_lines_are_the_verdicts_and_the_page(run_cli, store, two_files):
+    for file in two_files:
+        for spec in load_suite(str(file)).runs:
+            write_run(store, spec, [1.0, float(spec.args["agent"])])
+    status, out = run_cli("report", "--suite", *two_files, "--results-dir", store.root)
+    assert status == 0, out
+    lines = [line for line in out.splitlines() if line][-6:]
+    assert lines[0].startswith("tiny: 16 of 16 runs done, at 0.004% of the paper's length")
+    assert [line[:14] for line in lines[1:4]] == [f"({x}) undecided:" for x in "abe"]
+    assert lines[4] == "other: 4 of 4 runs done. One agent a setting: nothing to judge."
+    assert lines[5] == f"Written: {store.root / 'report' / 'report.html'}"
+    assert "Single" not in out  # single agents have no table here: the page has it
+
+
+def test_a_suite_without_the_tasks_that_are_asked_for_is_left_out(run_cli, store, two_files):
+    other = two_files[1]
+    other.write_text(other.read_text().replace('Hopper = "Pendulum-v1"', ""))
+    words = ["--suite", *two_files, "--results-dir", store.root, "--env", "Hopper", "--dry-run"]
+    for spec in load_suite(str(two_files[0])).runs:
+        write_run(store, spec, [1.0])
+    status, out = run_cli("run-all", *words)
+    assert status == 0, out
+    assert "tiny: Tiny. 8 runs" in out
+    assert "Single" not in out
+
+
+def test_what_a_suite_includes_is_run_once_when_it_is_asked_for_too(run_cli, store):
+    words = ["--suite", "smoke", "smoke_coinrun", "--results-dir", store.root, "--dry-run"]
+    found = make_episodes(seen_sampled=[[1.0]])
+    for spec in load_suite("smoke").runs:
+        write_run(store, spec, [1.0], episodes=found if "levels" in spec.evaluation else None)
+    status, out = run_cli("run-all", *words)
+    assert status == 0, out
+    assert "52 done before, 0 to do" in out
 
 
 def columns(out: str, suite: str) -> dict[str, str]:
@@ -235,7 +299,7 @@ def test_report_of_an_unfinished_suite(run_cli, store, suite, suite_file):
     write_run(store, suite.runs[0], [1.0, 2.0])
     status, out = run_cli("report", "--suite", suite_file, "--results-dir", store.root)
     assert status == 0
-    assert "2.0 (n 1, 0 failed, finds –)" in out
+    assert "(n 1, 0 failed, finds –)" in out
     assert "Missing" in out
 
 
@@ -261,6 +325,8 @@ def test_cost_says_what_was_added_and_keeps_it(run_cli, tmp_path, monkeypatch):
     ("words", "message"),
     [
         (["run-all", "--suite", "tabel1"], "no suite 'tabel1'"),
+        (["run-all", "--suite", "first", "first"], "name each suite once"),
+        (["report", "--suite", "first", "smok"], "no suite 'smok'"),
         (["run-all", "--env", "Hoper"], "Hopper?"),
         (["cost", "--implementation", "populatoin"], "population?"),
         (["run-all", "--jobs", "0"], "jobs must be at least 1, got 0"),

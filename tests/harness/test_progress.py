@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 
 import pytest
@@ -53,3 +54,15 @@ def test_what_was_done_before_does_not_count_as_speed(store, suite, monkeypatch)
         shown.update(suite.runs[:2])
     assert "starting" in out.getvalue()
     assert "25%" in out.getvalue()
+
+
+def test_runs_of_the_same_name_in_two_suites_count_each(store, suite, monkeypatch):
+    monkeypatch.setattr(progress, "PLAIN_INTERVAL", 0.0)
+    other = dataclasses.replace(suite.runs[0], suite="other")
+    write_run(store, other, [1.0, 2.0])
+    out = io.StringIO()
+    with Progress(Console(file=out, width=100), store, [suite.runs[0], other]) as shown:
+        shown.ended(other, "done in 1 s")
+        shown.update([suite.runs[0]])
+    assert "[1/2] other/ppo__Hopper__s1__a0  done in 1 s" in out.getvalue()
+    assert "1/2 runs  50%" in out.getvalue()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -48,29 +49,38 @@ def psi_and_reward(agents: pd.DataFrame, path: Path) -> bool:
 
 
 def findings(claim: Claim, path: Path) -> None:
-    """A claim's estimates with their 95% intervals, a panel for each kind of number."""
-    kinds: dict[str, list[Finding]] = {}
-    for finding in claim.findings:
-        if finding.about.endswith(": reward"):
-            continue  # the scales of the tasks differ by thousands: the page lists these
-        kinds.setdefault(finding.about, []).append(finding)
-    ordered = sorted(kinds.items(), key=lambda kind: -len(kind[1]))  # equals share a row
-    heights = [1 + 0.32 * len(found) for _, found in ordered[::2]]
+    """A claim's estimates with their 95% intervals, a panel for each kind of number.
+
+    Kinds that have one number each, such as the probability of improvement of each pair of
+    algorithms, share a panel. Differences of rewards are left out: the scales of the tasks differ
+    by thousands, and the page lists them.
+    """
+    shown = [finding for finding in claim.findings if not finding.about.endswith(": reward")]
+    counts = Counter(finding.about for finding in shown)
+    panels: dict[str, dict[str, Finding]] = {}
+    for finding in shown:
+        title, label = finding.about, finding.task
+        if counts[finding.about] == 1 and finding.task == "all" and ": " in finding.about:
+            label, title = finding.about.split(": ", 1)
+        panels.setdefault(title, {})[label] = finding
+
+    ordered = sorted(panels.items(), key=lambda panel: -len(panel[1]))  # equals share a row
+    heights = [0.8 + 0.28 * len(found) for _, found in ordered[::2]]
     columns = min(2, len(ordered))
     figure, axes = plt.subplots(
         len(heights), columns, squeeze=False, layout="constrained",
         figsize=(5.5 * columns, sum(heights)), height_ratios=heights,
     )  # fmt: skip
-    for axis in axes.flat[len(kinds) :]:
+    for axis in axes.flat[len(panels) :]:
         axis.set_visible(False)
-    for axis, (about, found) in zip(axes.flat, ordered, strict=False):
-        _draw_findings(axis, about, found)
+    for axis, (title, found) in zip(axes.flat, ordered, strict=False):
+        _draw_findings(axis, title, found)
     save(figure, path)
 
 
-def _draw_findings(axis: Axes, about: str, found: list[Finding]) -> None:
+def _draw_findings(axis: Axes, title: str, found: dict[str, Finding]) -> None:
     tidy(axis)
-    for y, finding in enumerate(reversed(found)):
+    for y, finding in enumerate(reversed(found.values())):
         mean, low, high, n = finding.estimate
         color = VERDICTS.get(finding.verdict, "gray")
         if not np.isnan(low):
@@ -80,8 +90,8 @@ def _draw_findings(axis: Axes, about: str, found: list[Finding]) -> None:
             f" n={n}", (1, y), xycoords=("axes fraction", "data"), fontsize=7, va="center",
             color="gray",
         )  # fmt: skip
-    axis.axvline(0.5 if "probability" in about else 0, color="black", linewidth=0.8)
+    axis.axvline(0.5 if "probability" in title else 0, color="black", linewidth=0.8)
     axis.locator_params(axis="x", nbins=6)
-    axis.set_yticks(range(len(found)), [f.task for f in reversed(found)])
+    axis.set_yticks(range(len(found)), list(reversed(found)), fontsize=8)
     axis.set_ylim(-0.6, len(found) - 0.4)
-    axis.set_title(about, fontsize=9)
+    axis.set_title(title, fontsize=9)

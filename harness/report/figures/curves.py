@@ -9,8 +9,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.ticker import EngFormatter
 
-from harness.report.figures.style import COLUMNS, colors_of, save, tidy
+from harness.report.figures.style import COLUMNS, colors_of, plain_logarithm, save, tidy
 from harness.report.results import Results
 from harness.statistics import interval_of_means
 
@@ -129,8 +130,10 @@ def _draw_panel(
         style = measure.columns[column]
         label = algorithm if column == first else None
         draw_curves(axis, found, label, colors[algorithm], style, interval=column == first)
+    axis.xaxis.set_major_formatter(EngFormatter(sep=""))
     if measure.log:
         axis.set_yscale("log")
+        plain_logarithm(axis)
     for mark in measure.marks:
         low, high = axis.get_ylim()
         if low <= mark <= high:

@@ -13,6 +13,7 @@ mpl.use("agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # Okabe and Ito's
 COLUMNS = 4  # panels side by side, at most
@@ -28,6 +29,13 @@ def tidy(axis: Axes) -> None:
     """No frame at the top and right, and a faint grid."""
     axis.spines[["top", "right"]].set_visible(False)
     axis.grid(alpha=0.25)
+
+
+def plain_logarithm(axis: Axes) -> None:
+    """Numbers such as 0.02 on a logarithmic y axis, also where it spans less than a decade."""
+    axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=8))
+    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.yaxis.set_minor_formatter(NullFormatter())
 
 
 def make_panels(names: Sequence[str], height: float = 2.9) -> tuple[Figure, dict[str, Axes]]:

@@ -21,13 +21,13 @@ def supported_by(n: int, failed: int, detectable: float, digits: int = 1) -> str
 
 
 def number(value: float, digits: int = 3) -> str:
-    """A number of so many significant digits without an exponent in between; a dash for NaN."""
+    """So many significant digits, an exponent only for the very small and large; NaN: a dash."""
     if math.isnan(value):
         return "–"
-    if value and not 1e-3 <= abs(value) < 1e6:
+    if value and not 1e-4 <= abs(value) < 1e6:
         return f"{value:.{digits - 1}e}"
-    text = f"{value:.{digits}g}"
-    return f"{float(text):,.0f}" if "e" in text else text
+    text = f"{value:#.{digits}g}" if value else "0"
+    return f"{float(text):.0f}" if "e" in text else text.removesuffix(".")
 
 
 def interval(mean: float, low: float, high: float, digits: int = 3) -> str:

@@ -13,9 +13,9 @@ import pandas as pd
 import pytest
 
 from harness.report.claims import Claim, to_frame
-from harness.report.page import write_report
+from harness.report.page import write_page, write_report
 from harness.report.results import Results, load_results
-from harness.report.table1 import Cell, make_cells
+from harness.report.tables.table1 import Cell, make_cells
 from harness.suite import load_suite
 from tests.harness.conftest import make_episodes, write_run
 from tests.harness.report.conftest import UPDATES, make_games, make_study
@@ -33,6 +33,10 @@ baseline = "ppo_reg"
 parameter = "radius"
 values = [0.1, 2]
 """
+
+
+MORE_ARMS = MORE[MORE.index("[[sweeps]]") :]
+RESTS = " (n 10, 0 failed, finds 0)"
 
 
 class Page(HTMLParser):
@@ -88,8 +92,8 @@ def report(store):
 
     def write(results):
         folder = store.report_path(results.suite.name)
-        _, claims = write_report(results, folder)
-        return folder, claims, Page((folder / "report.html").read_text())
+        part = write_report(results, folder)
+        return folder, part.claims, Page((folder / "report.html").read_text())
 
     return write
 
@@ -115,9 +119,9 @@ def written(tmp_path_factory) -> Written:
     )  # fmt: skip
     report = folder / "report"
     report.mkdir()
-    _, claims = write_report(results, report)
+    part = write_report(results, report)
     page = Page((report / "report.html").read_text())
-    return Written(results, report, make_cells(results), claims, page)
+    return Written(results, report, make_cells(results), part.claims, page)
 
 
 def test_the_page_shows_every_figure_and_each_is_there(written):
@@ -125,10 +129,12 @@ def test_the_page_shows_every_figure_and_each_is_there(written):
     files = [image["src"] for image in page.images]
     assert sorted(files) == [
         "ablation_1.png",
+        "arms.png",
         "claim_a.png",
         "claim_b.png",
         "learning_curves_1.png",
         "psi_and_reward.png",
+        "scores.png",
     ]
     assert sorted(path.name for path in folder.glob("*.png")) == sorted(files)
     for image in page.images:
@@ -137,12 +143,35 @@ def test_the_page_shows_every_figure_and_each_is_there(written):
 
 
 def test_a_logged_spectrum_has_its_figure(store, suite, report):
-    names = ("quotient_q50", "singular_value_mean", "squared_singular_value")
+    names = ("quotient_squared", "frobenius_squared_per_input")
     columns = {f"conditioning/{name}": [1.0, 2.0] for name in names}
     write_run(store, suite.runs[0], [1.0, 2.0], columns=columns)
     folder, _, page = report(load_results(suite, store))
-    assert "quotient_and_spectrum.png" in [image["src"] for image in page.images]
-    assert (folder / "quotient_and_spectrum.png").exists()
+    assert "jacobian.png" in [image["src"] for image in page.images]
+    assert (folder / "jacobian.png").exists()
+
+
+def test_j_has_a_table_and_its_curves(store, suite_file, report):
+    more = '[figures]\n"Both" = ["PPO", "PPO reg"]\n\n[environments]'
+    suite_file.write_text(suite_file.read_text().replace("[environments]", more))
+    suite = load_suite(str(suite_file))
+    for spec in suite.runs:
+        write_run(store, spec, [1.0, 2.0], columns={"conditioning/quotient_q50": [0.5, 0.25]})
+    _, _, page = report(load_results(suite, store))
+    assert "conditioning_1.png" in [image["src"] for image in page.images]
+    rows = [cells for cells in page.cells if cells[:2] == ["Hopper", "PPO reg"]]
+    assert rows == [["Hopper", "PPO reg", "4", "0.500", "0.250"]]
+
+
+def test_arms_have_a_table_and_a_picture(study, tmp_path):
+    values = {"PPO": 0.0, "size of delta=0.1": 3.0, "size of delta=2": -4.0}
+    results = study(lambda _, name, agent: agent + values[name], algorithms=["PPO"], more=MORE_ARMS)
+    write_report(results, tmp_path)
+    page = Page((tmp_path / "report.html").read_text())
+    assert {"arms.png", "ablation_1.png"} <= {image["src"] for image in page.images}
+    rows = {cells[0]: cells[1:4] for cells in page.cells if len(cells) == 8}
+    assert rows["size of delta=2"] == ["Hopper", "PPO", "-4.00 [-4.00, -4.00]" + RESTS]
+    assert pd.read_csv(tmp_path / "arms.csv")["reward"].tolist() == [3.0, -4.0]
 
 
 @pytest.mark.parametrize("runs", [0, 1])
@@ -201,7 +230,7 @@ def test_the_page_has_every_number_behind_the_verdicts(written):
 def test_the_papers_numbers_stand_beside_ours(written):
     page = written.page
     header = next(cells for cells in page.cells if cells[0] == "task")
-    assert header == ["task", "PPO", "PPO, paper", "PPO reg", "PPO reg, paper"]
+    assert header == ["task", "PPO", "paper", "PPO reg", "paper"]
     rows = {cells[0]: cells for cells in page.cells if len(cells) == 5}
     assert rows["Hopper"][2::2] == ["106.8", "18.6"]
     assert rows["Ant"][2::2] == ["414.1", "294.8"]
@@ -216,10 +245,12 @@ def test_the_notes_of_the_table_are_on_the_page(written):
 
 def test_final_policies_have_a_table_of_their_own(study, tmp_path):
     results = study(lambda *_: 1.0, final=lambda _, name, agent: len(name) + agent)
-    sections, _ = write_report(results, tmp_path)
+    part = write_report(results, tmp_path)
     page = Page((tmp_path / "report.html").read_text())
-    assert [s.title for s in sections] == [
-        "Table 1: training scores, beside the paper's", "Table 1: final policies",
+    assert [s.title for s in part.sections] == [
+        "The claims in pictures", "Table 1: training scores, beside the paper's",
+        "Table 1: final policies", "Smoothness of the final policies' actions",
+        "Conditioning at the end of training",
     ]  # fmt: skip
     assert "Table 1: final policies" in page.headings
     rows = [cells for cells in page.cells if cells[0] == "Hopper" and len(cells) == 3]
@@ -275,7 +306,7 @@ def test_names_of_a_suite_are_text_and_never_html(tmp_path, store, report):
     for spec in suite.runs:
         write_run(store, spec, [1.0, 2.0])
     _, _, page = report(load_results(suite, store))
-    assert not {"script", "b", "i", "em"} & set(page.tags)
+    assert not {"script", "b", "i"} & set(page.tags)
     assert all(set(image) == {"src", "alt"} for image in page.images)
     assert "x" not in [image["src"] for image in page.images]
     assert '"><img src=x onerror=alert(1)>' in page.headings
@@ -339,10 +370,11 @@ def test_a_page_of_games_has_table_2_and_nothing_of_table_1(games, report):
         "report.html", "table2.md", "table2.csv", "claims.csv", "figure4.png", "claim_d.png",
     }  # fmt: skip
     rows = {cells[0]: cells for cells in page.cells if len(cells) == 7}
-    assert rows["agent"][1:4] == ["seen", "seen, paper", "unseen"]
+    assert rows["agent"][1:4] == ["seen", "paper", "unseen"]
     assert rows["PPO reg"][:3] == ["PPO reg", "50.0 [0.0, 100.0] (n 1, 0 failed, finds –)", "60.7"]
     assert rows["PPO"][6] == "0.0 [0.0, 0.0] (n 1, 0 failed, finds –)"
-    assert "The agent's velocity is painted into the frame" in page.text
+    assert "the velocity painted" in page.text
+    assert "What differs from the paper" not in page.headings
     assert len(pd.read_csv(folder / "table2.csv")) == 2 * 4
     assert pd.read_csv(folder / "claims.csv")["claim"].tolist() == ["d", "d", "e"]
 
@@ -380,7 +412,7 @@ def test_a_page_of_both_has_both(games, report, store, suite):
 def test_a_page_of_games_before_anything_ran(report, store):
     _, claims, page = report(load_results(load_suite("table2"), store))
     assert [claim.verdict for claim in claims] == ["undecided"]
-    assert [image["src"] for image in page.images] == ["claim_d.png"]
+    assert page.images == []
     assert "Not all evaluated yet: PPO, " in page.text
 
 
@@ -437,11 +469,106 @@ def test_an_agent_with_one_episode_of_two_is_not_shown(games, report):
 def test_names_of_games_and_their_agents_are_text_and_never_html(games, report):
     agents = ["<script>x</script>", "<script>x</script> reg"]
     folder, _, page = report(games(agents, ["<em>Coin", "Maze"], gifs=True))
-    assert not {"script", "em"} & set(page.tags)
+    assert "script" not in page.tags
     assert all(set(image) == {"src", "alt"} for image in page.images)
     rows = [cells[0] for cells in page.cells if len(cells) == 7]
     assert rows[1:3] == [f"<em>Coin: {agent}" for agent in agents]
     assert "<em>Coin: <script>x</script>" in [cells[1] for cells in page.cells if len(cells) == 10]
-    assert "<script>x</script>: seen, unseen" in page.text
+    assert "<script>x</script>: a seen level, an unseen level" in page.text
     for image in page.images:
         assert (folder / unquote(image["src"])).exists()
+
+
+def test_a_third_kind_of_levels_has_its_episode(store, report):
+    suite = load_suite("themes", seeds=1)
+    run = suite.runs[0]
+    found = [played(), make_episodes(themes_sampled=[[1], [0]], themes_greedy=[[1], [0]])]
+    write_run(store, run, [1.0], episodes=pd.concat(found))
+    for split in ("seen", "unseen", "themes"):
+        store.path(run, f"{split}.gif").write_bytes(b"GIF89a")
+    _, _, page = report(load_results(suite, store))
+    shown = [Path(image["src"]).name for image in page.images if image["src"].endswith(".gif")]
+    assert shown == ["seen.gif", "unseen.gif", "themes.gif"]
+    assert f"{run.algorithm} on that level in other themes" in [x["alt"] for x in page.images]
+
+
+# --- what the numbers come from -------------------------------------------------------------------
+
+
+def test_the_page_says_what_made_its_numbers(store, suite, report):
+    for spec in suite.runs[:2]:
+        write_run(store, spec, [1.0])
+    results = load_results(suite, store)
+    for number, spec in enumerate(results.specs.values()):
+        session = spec["sessions"][-1]
+        session.update(commit=f"{number}" * 40, clean=True, processor="Abacus", cores=3)
+    _, _, page = report(results)
+    rows = {cells[0]: cells[1] for cells in page.cells if len(cells) == 2}
+    assert rows["commits"] == "0000000000 (1), 1111111111 (1)"
+    assert rows["implementations"] == "single file (2)"
+    assert rows["machines"] == "Abacus, 3 cores (2)"
+    assert rows["baselines and their versions"].startswith("ppo_reg ")
+    assert {"Python", "PyTorch", "NumPy", "Gymnasium"} <= set(rows)
+    assert "The runs mix commits: 0000000000 (1), 1111111111 (1)." in page.text
+    assert "Before you trust a comparison" in page.text
+
+
+def test_a_page_whose_runs_share_their_origin_has_no_warning(store, suite, report):
+    for spec in suite.runs[:2]:
+        write_run(store, spec, [1.0])
+    results = load_results(suite, store)
+    for spec in results.specs.values():
+        spec["sessions"][-1]["clean"] = True
+    _, _, page = report(results)
+    assert "Before you trust a comparison" not in page.text
+
+
+def test_runs_that_diverged_are_named_with_update_and_what(store, suite, report):
+    write_run(store, suite.runs[0], [1.0, 2.0], diverged=True)
+    _, _, page = report(load_results(suite, store))
+    assert "ppo__Hopper__s1__a0: loss at update 2: loss is NaN" in page.text
+
+
+# --- one agent, and several suites ----------------------------------------------------------------
+
+
+@pytest.fixture
+def single(store, suite_file):
+    """Results of one agent a setting."""
+    suite = load_suite(str(suite_file), seeds=1, agents=1)
+    suite = dataclasses.replace(suite, name="single", title="Single agents")
+    for spec in suite.runs:
+        write_run(store, spec, [1.0, 2.0])
+    return load_results(suite, store)
+
+
+def test_single_agents_are_not_judged(single, report):
+    folder, claims, page = report(single)
+    assert claims == []
+    assert page.verdicts == []
+    assert "One agent a setting: nothing to judge." in page.text
+    assert not list(folder.glob("claim_*.png"))
+    assert not (folder / "scores.png").exists()
+    assert (folder / "claims.csv").exists()
+
+
+def test_a_page_of_several_suites_has_a_part_for_each_in_order(written, single, store, tmp_path):
+    folders = [tmp_path / name for name in ("judged", "single")]
+    for folder in folders:
+        folder.mkdir()
+    parts = [
+        write_report(results, folder)
+        for results, folder in zip((written.results, single), folders, strict=True)
+    ]
+    together = tmp_path / "together"
+    together.mkdir()
+    write_page(parts, together / "report.html")
+    page = Page((together / "report.html").read_text())
+    text = page.text.partition("How this differs from the paper")[0]
+    order = ["supported at 0.08%", "Table 1", "Single agents", "nothing to judge"]
+    places = [text.index(what) for what in order]
+    assert places == sorted(places)
+    assert len(text) < len(page.text)
+    sources = [Path(unquote(image["src"])) for image in page.images]
+    assert {source.parts[:2] for source in sources} == {("..", "judged"), ("..", "single")}
+    assert all((together / source).exists() for source in sources)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from harness.report.published import paper_numbers, zoo_numbers
+from harness.report.published import deviations, paper_numbers, zoo_numbers
 from harness.suite import load_suite
 
 TASKS = [
@@ -74,3 +74,22 @@ def test_the_zoos_agents_are_the_zoos(algorithm):
 
 def test_the_zoo_has_no_regularized_agents():
     assert zoo_numbers("PPO reg") == {}
+
+
+@pytest.mark.parametrize(
+    ("heading", "words"),
+    [
+        ("What differs from the paper", ("HalfCheetah", "Time limits", "Optimization")),
+        ("CoinRun today", ("EnvPool", "15 actions", "velocity", "visual themes", "Dropout",
+                           "new levels", "difficulty 3", "clipped as PPO's ratio")),
+    ],
+)  # fmt: skip
+def test_each_deviation_that_a_reader_would_ask_for_is_named(heading, words):
+    section = deviations(heading)
+    assert all(word in section for word in words)
+    assert "\n## " not in section
+
+
+def test_a_section_that_there_is_not_is_an_error():
+    with pytest.raises(ValueError, match="no section 'Elsewhere'"):
+        deviations("Elsewhere")

@@ -1,10 +1,10 @@
-"""Table 2 and Figure 4, from episodes with known rates."""
+"""Table 2, from episodes with known rates."""
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
-import matplotlib.image
 import numpy as np
 import pandas as pd
 import pytest
@@ -12,12 +12,10 @@ from rich.console import Console
 from scipy import stats
 
 from harness.report.results import load_results
-from harness.report.table2 import (
-    DEVIATIONS,
+from harness.report.tables.table2 import (
     THEMES,
     make_cells,
     notes,
-    success_curves,
     to_frame,
     to_markdown,
     to_rich,
@@ -103,7 +101,8 @@ def test_the_notes_say_what_the_cells_rest_on(results, cells):
     assert "Steps done: 300; the paper's runs have 50,000,000." in said[2]
     others = "PPO-D, PPO-D reg, PPO-IMP, PPO-IMP reg, PPO-l2, PPO-l2 reg"
     assert said[3] == f"Not all evaluated yet: {others}."
-    assert said[4:] == list(DEVIATIONS)
+    assert len(said) == 5
+    assert "Ours are the levels that follow the training set, with" in said[4]
 
 
 def test_full_runs_that_are_all_there_are_not_called_short_or_missing(store):
@@ -112,23 +111,33 @@ def test_full_runs_that_are_all_there_are_not_called_short_or_missing(store):
         write_run(store, run, [1.0], columns={"global_step": [49_000_000]}, episodes=episodes())
     results = load_results(suite, store)
     said = notes(results, make_cells(results))
-    assert len(said) == 2 + len(DEVIATIONS)
+    assert len(said) == 3
 
 
-def test_without_runs_there_are_the_papers_numbers_and_the_deviations(store):
+def test_without_runs_there_are_the_papers_numbers(store):
     results = load_results(load_suite("table2"), store)
     cells = make_cells(results)
     said = notes(results, cells)
     assert said[0].startswith("Not all evaluated yet: PPO, ")
-    assert said[1:] == list(DEVIATIONS)
+    assert len(said) == 2
     _, rows = to_rows(results, cells)
     assert rows[0][:3] == ["PPO", "–", "55.0"]
 
 
-def test_each_deviation_that_a_reader_would_ask_for_is_named():
-    said = " ".join(DEVIATIONS).lower()
-    for word in ("engine", "15 actions", "velocity", "visual themes", "unseen levels", "dropout"):
-        assert word in said
+@pytest.mark.parametrize(
+    ("unseen", "words"), [("next", "the levels that follow"), ("unbounded", "drawn without bound")]
+)
+def test_what_the_unseen_levels_are_is_said(tmp_path, unseen, words):
+    results = games_of(tmp_path, ["PPO"], {"CoinRun": "coinrun"})
+    runs = [
+        dataclasses.replace(run, evaluation={**run.evaluation, "unseen": unseen})
+        for run in results.suite.runs
+    ]
+    suite = dataclasses.replace(results.suite, runs=runs)
+    said = notes(dataclasses.replace(results, suite=suite), make_cells(results))[-1]
+    assert words in said
+    assert "difficulty 3 only" in said
+    assert "not of the same test" in said
 
 
 def test_rows_are_agents_and_columns_kinds_of_levels_beside_the_paper(results, cells):
@@ -147,7 +156,7 @@ def test_markdown_has_the_table_and_the_notes(results, cells):
     assert lines[0] == f"# {results.suite.title}"
     row = next(line for line in lines if line.startswith("| PPO |"))
     assert row.startswith(f"| PPO | {SURE} | 55.0 | {SURE} |")
-    assert [line for line in lines if line.startswith("- ")][-1] == f"- {DEVIATIONS[-1]}"
+    assert [line for line in lines if line.startswith("- ")][-1].endswith("not of the same test.")
 
 
 def test_the_frame_has_a_row_for_each_cell(cells):
@@ -200,62 +209,6 @@ def test_each_game_has_its_rows_and_only_coinrun_the_papers_numbers(tmp_path):
         ["CoinRun: PPO", "0.0 (n 1, 0 failed, finds –)", "55.0"],
         ["Maze: PPO", "100.0 (n 1, 0 failed, finds –)", ""],
     ]
-
-
-# --- Figure 4 -------------------------------------------------------------------------------------
-
-
-def write_curves(store, suite, algorithm, seed, steps, seen):
-    run = next(r for r in suite.runs if (r.algorithm, r.args["seed"]) == (algorithm, seed))
-    columns = {"global_step": steps, "eval/success_seen": seen}
-    columns["eval/success_unseen"] = np.array(seen) / 2
-    write_run(store, run, [0.0] * len(steps), psi=0.9, columns=columns, done=False)
-
-
-def test_curves_of_seeds_that_count_their_steps_differently_are_one(store, tmp_path, drawn):
-    suite = load_suite("table2", seeds=2)
-    write_curves(store, suite, "PPO", 1, [100, 198, 300], [np.nan, 0.2, 0.4])
-    write_curves(store, suite, "PPO", 2, [98, 200, 296], [np.nan, 0.4, 0.8])
-    success_curves(load_results(suite, store), tmp_path / "figure4.png")
-    axes = np.array(drawn().axes).reshape(3, 4)
-    assert [axis.get_title() for axis in axes[0]] == ["PPO", "PPO-l2", "PPO-D", "PPO-IMP"]
-    assert [axis.get_ylabel() for axis in axes[:, 0]] == [
-        "success, seen", "success, unseen", "psi",
-    ]  # fmt: skip
-    for axis, x, y in (
-        (axes[0, 0], [199, 298], [0.3, 0.6]),
-        (axes[1, 0], [199, 298], [0.15, 0.3]),
-        (axes[2, 0], [99, 199, 298], [0.9, 0.9, 0.9]),
-    ):
-        (line,) = axis.get_lines()
-        np.testing.assert_allclose(line.get_xdata(), x)
-        np.testing.assert_allclose(line.get_ydata(), y)
-        assert len(axis.collections) == 1  # the interval over the two
-    assert not axes[0, 1].get_lines()
-
-
-def test_the_legend_tells_plain_from_regularized(store, tmp_path, drawn):
-    suite = load_suite("table2")
-    for name in ("PPO", "PPO reg"):
-        write_curves(store, suite, name, 1, [100, 200], [0.1, 0.2])
-    success_curves(load_results(suite, store), tmp_path / "figure4.png")
-    assert [text.get_text() for text in drawn().legends[0].get_texts()] == ["plain", "reg"]
-    assert matplotlib.image.imread(tmp_path / "figure4.png").std() > 0.01
-
-
-def test_a_figure_is_drawn_of_runs_that_were_never_evaluated_on_the_way(store, tmp_path, drawn):
-    suite = load_suite("table2")
-    write_curves(store, suite, "PPO", 1, [100, 200], [np.nan, np.nan])
-    success_curves(load_results(suite, store), tmp_path / "figure4.png")
-    axes = np.array(drawn().axes).reshape(3, 4)
-    assert [len(axis.get_lines()) for axis in axes[:, 0]] == [0, 0, 1]
-
-
-def test_each_game_has_its_columns(tmp_path, drawn):
-    results = games_of(tmp_path, ["PPO", "PPO reg"], {"CoinRun": "coinrun", "Maze": "maze"})
-    success_curves(results, tmp_path / "figure4.png")
-    titles = [axis.get_title() for axis in drawn().axes[:2]]
-    assert titles == ["CoinRun: PPO", "Maze: PPO"]
 
 
 # --- unseen themes --------------------------------------------------------------------------------
