@@ -308,7 +308,8 @@ def test_run_all_runs_only_what_is_not_archived(run_cli, elsewhere, runs, suite_
     assert row.replace("│", " ").split() == ["tiny", "4", "12", "100,000", "of", "3,200"]
     status, out = run_cli("run-all", *words, "--dry-run", "--env", "Hopper", "--seeds", 1)
     assert status == 0, out
-    assert "4 runs, 800 steps; 2 done before, 2 to do" in out
+    assert "4 runs, 800 steps" in out
+    assert "2 done before, 2 to do" in out
     assert not elsewhere.path(runs[0]).exists()
 
 
