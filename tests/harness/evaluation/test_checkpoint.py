@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import os
 import shutil
@@ -94,3 +95,18 @@ def test_settings_that_are_no_longer_valid_are_refused(tmp_path):
     torch.save(saved, tmp_path / "checkpoint.pt")
     with pytest.raises(EvaluationError, match=r"ppo_reg refuses: gamma must be in \[0, 1\]"):
         read_checkpoint(tmp_path)
+
+
+def test_an_agent_that_a_gpu_trained_is_read_on_the_cpu(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(torch.serialization, "location_tag", lambda storage: "cuda:0")
+        write_checkpoint(tmp_path)
+    learner = read_checkpoint(tmp_path).learner
+    assert learner["actor"]["log_std"].device == torch.device("cpu")
+
+
+def test_what_was_read_cannot_be_changed(tmp_path):
+    write_checkpoint(tmp_path)
+    found = read_checkpoint(tmp_path)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        found.baseline = "trpo_reg"

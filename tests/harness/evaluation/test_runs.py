@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -235,3 +236,8 @@ def test_flags_for_control_are_refused_by_a_run_of_coinrun(path):
 def test_counts_start_at_1(name):
     with pytest.raises(EvaluationError, match=f"{name} must be at least 1, got 0"):
         Settings(**{name: 0})
+
+
+def test_what_is_asked_cannot_be_changed():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Settings().episodes = 0

@@ -65,3 +65,9 @@ def test_the_change_of_actions_by_hand():
 def test_constant_actions_are_smooth_and_one_action_has_no_measure(measure):
     assert measure(np.full((5, 2), 0.7)) == pytest.approx(0, abs=1e-12)
     assert math.isnan(measure(np.ones((1, 2))))
+
+
+def test_two_actions_have_both_measures():
+    """A change of 2; M = 1 at half the rate, of n = 2 frequencies: 2 / (2 · 8) · 1 · 4."""
+    assert action_change(column(1, -1)) == 2.0
+    assert smoothness(column(1, -1), rate=8.0) == pytest.approx(0.5)
