@@ -104,10 +104,10 @@ def _control(results: Results, found: list[claims.Claim], folder: Path) -> list[
     sections = [
         Section("Learning curves", pictures=_curves(results, folder)),
         Section("The claims in pictures", pictures=_claims(results, found, folder)),
+        _arms(results, folder),
         _scores("Table 1: training scores, beside the paper's", results, cells, folder),
         _final(results, final, folder),
         _smoothness(results, folder),
-        _arms(results, folder),
         _conditioning(results, folder),
     ]
     return [section for section in sections if section.rows or section.pictures]

@@ -34,6 +34,7 @@ def draw_arms(arms: Sequence[Arm], path: Path) -> None:
             _draw(top, arm.reward, y + 0.15, COLORS[0], "training score")
             _draw(top, arm.final, y - 0.15, COLORS[1], "final policy")
             _draw(bottom, arm.psi, y, COLORS[2], "psi by the yardstick")
+            bottom.plot(arm.plain_psi, y, "|", color="black", markersize=10, label="psi, plain")
         top.axvline(0, color="black", linewidth=0.8)
         top.set_title(task, fontsize=11)
         top.set_xlabel("difference of the score")

@@ -42,6 +42,8 @@ class Arm:
     """runs of both whose own numbers became non-finite"""
     psi: Estimate
     """by the yardstick, of the arm itself"""
+    plain_psi: float
+    """the mean of what it is compared with"""
     quotient: float
     """its median J"""
     own_psi: float
@@ -106,6 +108,7 @@ def _arm(
         detectable=float(detectable_difference(np.array(spread), np.array(len(reward)))),
         failed=int(both["failed"].sum()),
         psi=estimate_mean(own["psi"].dropna().to_numpy()),
+        plain_psi=float(of_task.loc[of_task["algorithm"] == plain, "psi"].mean()),
         quotient=_at_the_end(results, task, name, "quotient_q50"),
         own_psi=_at_the_end(results, task, name, "own_psi"),
     )  # fmt: skip
@@ -130,16 +133,16 @@ def _at_the_end(results: Results, task: str, name: str, column: str) -> float:
 
 def to_rows(arms: list[Arm]) -> tuple[list[str], list[list[str]]]:
     """The table as text: a header, and a row for each arm and task."""
-    header = ["arm", "task", "against", "training score", "final policy", "psi", "median J",
-              "own psi"]  # fmt: skip
+    header = ["arm", "task", "against", "training score", "final policy", "psi", "psi, plain",
+              "median J", "own psi"]  # fmt: skip
     rows = []
     for arm in arms:
         rests = f"(n {arm.reward.n}, {arm.failed} failed, finds {number(arm.detectable)})"
         rows.append(
             [
                 arm.arm, arm.task, arm.against, f"{interval(*arm.reward[:3])} {rests}",
-                interval(*arm.final[:3]), interval(*arm.psi[:3]), number(arm.quotient),
-                number(arm.own_psi),
+                interval(*arm.final[:3]), interval(*arm.psi[:3]),
+                number(arm.plain_psi), number(arm.quotient), number(arm.own_psi),
             ]
         )  # fmt: skip
     return header, rows
@@ -153,7 +156,14 @@ def to_frame(arms: list[Arm]) -> pd.DataFrame:
         for name in ("reward", "final", "psi"):
             mean, low, high, n = getattr(arm, name)
             row |= {name: mean, f"{name}_low": low, f"{name}_high": high, f"{name}_n": n}
-        row |= {"detectable": arm.detectable, "failed": arm.failed}
-        row |= {"median_quotient": arm.quotient, "own_psi": arm.own_psi}
-        rows.append(row)
+        rows.append(
+            {
+                **row,
+                "plain_psi": arm.plain_psi,
+                "median_quotient": arm.quotient,
+                "own_psi": arm.own_psi,
+                "detectable": arm.detectable,
+                "failed": arm.failed,
+            }
+        )
     return pd.DataFrame(rows)

@@ -169,7 +169,7 @@ def test_arms_have_a_table_and_a_picture(study, tmp_path):
     write_report(results, tmp_path)
     page = Page((tmp_path / "report.html").read_text())
     assert {"arms.png", "ablation_1.png"} <= {image["src"] for image in page.images}
-    rows = {cells[0]: cells[1:4] for cells in page.cells if len(cells) == 8}
+    rows = {cells[0]: cells[1:4] for cells in page.cells if len(cells) == 9}
     assert rows["size of delta=2"] == ["Hopper", "PPO", "-4.00 [-4.00, -4.00]" + RESTS]
     assert pd.read_csv(tmp_path / "arms.csv")["reward"].tolist() == [3.0, -4.0]
 

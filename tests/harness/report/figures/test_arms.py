@@ -68,9 +68,9 @@ def test_an_arm_is_two_differences_and_a_psi(drawn, tmp_path):
     nothing = Estimate(np.nan, np.nan, np.nan, 0)
     arms = [
         Arm("Hopper", "printed sign", "PPO", Estimate(-3.0, -5.0, -1.0, 10),
-            Estimate(2.0, 1.0, 4.0, 10), 3.0, 0, Estimate(0.5, 0.4, 0.6, 10), 0.3, 0.5),
+            Estimate(2.0, 1.0, 4.0, 10), 3.0, 0, Estimate(0.5, 0.4, 0.6, 10), 0.9, 0.3, 0.5),
         Arm("Hopper", "per batch", "PPO", Estimate(1.0, np.nan, np.nan, 2), nothing, np.nan, 0,
-            Estimate(0.2, np.nan, np.nan, 2), 0.1, 0.2),
+            Estimate(0.2, np.nan, np.nan, 2), 0.8, 0.1, 0.2),
     ]  # fmt: skip
     draw_arms(arms, tmp_path / "figure.png")
     top, bottom = drawn().axes
@@ -83,5 +83,7 @@ def test_an_arm_is_two_differences_and_a_psi(drawn, tmp_path):
     assert spans == [[-5.0, -1.0], [1.0, 4.0]]
     psis = [x.get_xdata()[0] for x in bottom.get_lines() if x.get_marker() == "o"]
     assert psis == [0.5, 0.2]
+    plain = [x.get_xdata()[0] for x in bottom.get_lines() if x.get_marker() == "|"]
+    assert plain == [0.9, 0.8]
     names = [text.get_text() for text in drawn().legends[0].get_texts()]
-    assert names == ["training score", "final policy", "psi by the yardstick"]
+    assert names == ["training score", "final policy", "psi by the yardstick", "psi, plain"]

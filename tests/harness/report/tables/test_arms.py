@@ -53,6 +53,7 @@ def test_differences_are_paired(results):
 def test_psi_is_the_arms_own_by_the_yardstick(results):
     _, regularized = make_arms(results)
     assert regularized.psi.mean == pytest.approx(15.25)
+    assert regularized.plain_psi == pytest.approx(10.25)
     assert np.isnan(regularized.quotient)
     assert np.isnan(regularized.own_psi)
 
