@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from urllib.parse import quote
 
@@ -31,6 +32,7 @@ def write_page(parts: list[Part], path: Path) -> None:
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters["url"] = lambda file: quote(os.path.relpath(file, path.parent))
+    environment.filters["lines"] = lambda text: re.split(r" (?=[\[{(])", text)
     template = environment.from_string((Path(__file__).parent / "page.html").read_text())
     path.write_text(template.render(parts=parts, deviations=_deviations(parts)))
 

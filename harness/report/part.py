@@ -103,7 +103,10 @@ def _control(results: Results, found: list[claims.Claim], folder: Path) -> list[
     final = table1.make_cells(results, "final")
     sections = [
         Section("Learning curves", pictures=_curves(results, folder)),
-        Section("The claims in pictures", pictures=_claims(results, found, folder)),
+        Section(
+            "The claims in pictures" if found else "Psi and reward",
+            pictures=_claims(results, found, folder),
+        ),
         _arms(results, folder),
         _scores("Table 1: training scores, beside the paper's", results, cells, folder),
         _final(results, final, folder),

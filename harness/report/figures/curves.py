@@ -11,7 +11,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter
 
-from harness.report.figures.style import COLUMNS, colors_of, plain_logarithm, save, tidy
+from harness.report.figures.style import COLUMNS, colors_of, plain_logarithm, save, tidy, width_of
 from harness.report.results import Results
 from harness.statistics import interval_of_means
 
@@ -81,7 +81,7 @@ def draw_measures(
     columns = min(COLUMNS, len(tasks))
     blocks = -(-len(tasks) // columns)
     figure, axes = plt.subplots(
-        len(rows) * blocks, columns, figsize=(max(3.4 * columns, 5), 2.1 * len(rows) * blocks),
+        len(rows) * blocks, columns, figsize=(width_of(columns), 2.1 * len(rows) * blocks),
         squeeze=False, sharex=True, layout="constrained",
     )  # fmt: skip
     for axis in axes.flat:

@@ -100,7 +100,7 @@ def make_cells(results: Results, outcome: str = "reward") -> list[Cell]:
             Cell(
                 environment=environment,
                 algorithm=algorithm,
-                estimate=estimate_mean(scores, skewed=is_skewed(arms)),
+                estimate=estimate_mean(scores, skewed=is_skewed(arms) or is_skewed([scores])),
                 scores=tuple(float(score) for score in scores),
                 seeds=scored["seed"].nunique(),
                 agents=len(scored),

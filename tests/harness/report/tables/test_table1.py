@@ -72,6 +72,17 @@ def test_a_tenth_of_successes_anywhere_on_the_task_leaves_ranges(study):
     assert [c.text.split(" (")[0] for c in cells] == ["0.5 {0.0 to 1.0}", "50.5 {0.0 to 500.0}"]
 
 
+def test_a_skewed_cell_beside_a_wide_one_has_no_interval(study):
+    """Taken together the two do not look skewed: the wide one drowns the other."""
+
+    def reward(_task, name, agent):
+        return 1000.0 * agent if name == "PPO reg" else 50.0 - 40.0 * (agent == 0)
+
+    cells = make_cells(study(reward))
+    assert cells[0].text.startswith("46.0 {10.0 to 50.0}")
+    assert cells[1].text.startswith("4500.0 [")
+
+
 def test_failed_agents_count_with_the_worst_of_their_task(study):
     results = study(
         lambda _, name, agent: agent - 20.0 * (name == "PPO reg"),
