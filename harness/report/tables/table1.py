@@ -100,7 +100,7 @@ def make_cells(results: Results, outcome: str = "reward") -> list[Cell]:
             Cell(
                 environment=environment,
                 algorithm=algorithm,
-                estimate=estimate_mean(scores, skewed=is_skewed(arms) or is_skewed([scores])),
+                estimate=_estimate(scores, arms),
                 scores=tuple(float(score) for score in scores),
                 seeds=scored["seed"].nunique(),
                 agents=len(scored),
@@ -114,6 +114,18 @@ def make_cells(results: Results, outcome: str = "reward") -> list[Cell]:
             )
         )
     return cells
+
+
+def _estimate(scores: np.ndarray, arms: list[np.ndarray]) -> Estimate:
+    """A cell's mean, with its interval unless the cell or its task is skewed.
+
+    Where scores take two values, some resamples have next to no spread of their own, and the
+    studentized interval breaks down: one of over twice the scores' range is left out.
+    """
+    found = estimate_mean(scores, skewed=is_skewed(arms) or is_skewed([scores]))
+    if found.n and found.high - found.low > 2 * np.ptp(scores):
+        return found._replace(low=np.nan, high=np.nan)
+    return found
 
 
 def algorithms_of(suite: Suite) -> list[str]:
@@ -155,7 +167,8 @@ def notes(results: Results, cells: list[Cell]) -> list[str]:
         lines.append(
             "[Brackets] hold the 95% studentized bootstrap interval of the mean over agents. "
             "{Braces} hold the smallest and the largest score, where there are fewer than 5 "
-            "agents, or fewer than 30 with skewed scores: no interval can be trusted there."
+            "agents, or fewer than 30 with skewed or two-valued scores: no interval can be trusted "
+            "there."
         )
         lines.append(
             "In parentheses: agents, failed ones among them, and the difference to an arm of the "
