@@ -25,6 +25,13 @@ PAPER: dict[str, Any] = {
     "radius": 1.0,
 }
 
+SPECTRUM = (
+    "conditioning/singular_value_max",
+    "conditioning/singular_value_mean",
+    "conditioning/frobenius_squared_per_input",  # E[J²] for small delta: ‖Jacobian‖_F² / n
+    "conditioning/condition_number",
+)
+
 
 class ConditioningProbe:
     """Measures a policy while it is trained, without a trace in it or in the training's noise.
@@ -160,14 +167,6 @@ class ConditioningProbe:
             (values[:, 0] / values[:, -1]).median(),
         )
         return dict(zip(SPECTRUM, torch.stack(numbers).tolist(), strict=True))
-
-
-SPECTRUM = (
-    "conditioning/singular_value_max",
-    "conditioning/singular_value_mean",
-    "conditioning/frobenius_squared_per_input",  # E[J²] for small delta: ‖Jacobian‖_F² / n
-    "conditioning/condition_number",
-)
 
 
 def _gradient_norm(loss: Tensor, parameters: list[Tensor]) -> Tensor:

@@ -295,7 +295,7 @@ def cost(
     env: tuple[str, ...] = ("Hopper",),
     repetitions: int = 10,
     updates: int = 6,
-    results_dir: Path = Path("results"),
+    results_dir: Path = RESULTS,
 ) -> None:
     """Measure what the penalty costs: plain and regularized runs in turn, on this machine alone.
 

@@ -11,11 +11,11 @@ import numpy as np
 import pandas as pd
 
 from harness.identity import Changes, compare, make_args
+from harness.scores import SPEED
+from harness.statistics.scores import EPISODES
 from harness.suite import RunSpec
 
 POINTS = 100  # that a curve is thinned to, at most
-SPEED = "charts/SPS"  # columns that begin so differ each time that a run is run
-EPISODES = "charts/episodes"
 OF_EPISODES = ("charts/episodic_return", "charts/episodic_length", "charts/success_rate")
 """columns that are means over the episodes that ended in an update"""
 
