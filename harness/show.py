@@ -105,10 +105,10 @@ def evaluation_tables(found: dict[str, pd.DataFrame]) -> list[Table]:
 def show_others(found: list[Results]) -> None:
     """What the other suites would take here, at the speed that these ones' runs have shown."""
     speed = {
-        (run.baseline, run.environment): results.metrics[run.run_id]["charts/SPS"].iloc[-1]
+        (run.baseline, run.environment): results.scores[run.run_id]["final/charts/SPS"]
         for results in reversed(found)  # the first one's count
         for run in results.suite.runs
-        if run.run_id in results.metrics and "levels" not in run.evaluation  # too short to tell
+        if run.run_id in results.scores and "levels" not in run.evaluation  # too short to tell
     }
     shown = {results.suite.name for results in found}
     for name in suite_names():
