@@ -58,9 +58,10 @@ class Archives:
         found = [x for x in self._of(spec) if x.total_timesteps == length]
         return [record for record in found if record.changes(spec)]
 
-    def lengths(self, spec: RunSpec) -> dict[int, Path]:
-        """The lengths that the run is archived with, and where."""
-        return {record.total_timesteps: record.place for record in self._of(spec)}
+    def shorter(self, spec: RunSpec) -> list[Record]:
+        """Archived runs that differ from this one in having fewer steps, and in nothing else."""
+        found = [x for x in self._of(spec) if x.total_timesteps < spec.args["total_timesteps"]]
+        return [record for record in found if set(record.changes(spec)) == {"total_timesteps"}]
 
     def _of(self, spec: RunSpec) -> list[Record]:
         if self.root is None:
@@ -129,6 +130,15 @@ def write_checkpoints(path: Path, files: dict[str, Path]) -> None:
     temporary.replace(target)
 
 
+def names_in(path: Path) -> set[str]:
+    """The run ids that a file of checkpoints holds; none if it is damaged."""
+    try:
+        with zipfile.ZipFile(path) as file:
+            return {name.removesuffix(".pt") for name in file.namelist()}
+    except zipfile.BadZipFile:
+        return set()
+
+
 def _to_json(record: Record) -> dict[str, Any]:
     curves = record.curves
     if record.updates == 1:
@@ -141,6 +151,7 @@ def _to_json(record: Record) -> dict[str, Any]:
         "run_id": record.run_id,
         "spec": spec,
         "done": record.done,
+        "scores_version": record.scores_version,
         "scores": {name: _number(value) for name, value in record.scores.items()},
         "updates": block,
         "curves": {name: [_round(x) for x in column] for name, column in curves.items()},
@@ -236,6 +247,7 @@ def _from_json(content: dict[str, Any], path: Path) -> Record:
         run_id=content["run_id"],
         spec=content["spec"],
         done=content["done"],
+        scores_version=content["scores_version"],
         scores={name: _float(value) for name, value in content["scores"].items()},
         updates=content["updates"],
         curves=_frame(content["curves"]),

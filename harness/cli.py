@@ -18,14 +18,16 @@ from rich.table import Table
 from harness.archive import ArchiveError
 from harness.cost import IMPLEMENTATIONS, CostError, measure_in_turn
 from harness.estimate import EstimateError, measure
+from harness.evaluation.settings import EvaluationError, Settings, Unseen
 from harness.extension import refuse_extension
 from harness.launchers.groups import make_groups
 from harness.launchers.local import Outcome, cores, run_local
 from harness.pack import pack
 from harness.progress import Progress
+from harness.provenance import ROOT
 from harness.report.cost import measured_in_turn
 from harness.report.results import TIMED, load_results
-from harness.schema import SuiteError, Unseen, check_known, suite_names
+from harness.schema import SuiteError, check_known, suite_names
 from harness.show import (
     console,
     evaluation_tables,
@@ -36,13 +38,13 @@ from harness.show import (
     show_outcome,
     show_verdicts,
 )
-from harness.store import STATES, EvaluationError, Store, StoreError
+from harness.store import STATES, Store, StoreError
 from harness.suite import RunSpec, Suite, load_suite, load_suites
 
 app = tyro.extras.SubcommandApp()
 DEFAULT_SUITES = ("first", "smoke")
 RESULTS = Path("results")
-ARCHIVES = Path("docs/results")
+ARCHIVES = ROOT / "docs" / "results"
 ERRORS = (  # what a person can mend, each with a sentence that says how
     SuiteError,
     StoreError,
@@ -58,7 +60,7 @@ def run_all(
     suite: tuple[str, ...] = DEFAULT_SUITES,
     jobs: int | None = None,
     results_dir: Path = RESULTS,
-    archives: Path = ARCHIVES,
+    archives: Path | None = None,
     total_timesteps: int | None = None,
     extend: bool = False,
     seeds: int | None = None,
@@ -77,7 +79,8 @@ def run_all(
             part for each in this order.
         jobs: Runs at a time, one core each; by default all cores.
         results_dir: Where the runs' folders and the reports go.
-        archives: Where archives of finished runs are: what they hold is not run again.
+        archives: Where archives of finished runs are: what they hold is not run again. By default
+            docs/results of this checkout.
         total_timesteps: Environment steps of each run, instead of the suite's.
         extend: Continue finished runs to --total-timesteps, as if they had had them from the start.
             The shorter runs' scores and evaluations are kept.
@@ -94,7 +97,7 @@ def run_all(
         raise SuiteError(f"jobs must be at least 1, got {jobs}")
     if extend and total_timesteps is None:
         raise SuiteError("--extend needs --total-timesteps: the length to continue the runs to")
-    store = Store(results_dir, archives)
+    store = Store(results_dir, archives or ARCHIVES)
     plans = load_suites(suite, total_timesteps=total_timesteps, seeds=seeds, agents=agents, env=env)
     runs = _distinct(plans.values())
     for spec in runs:
@@ -152,7 +155,7 @@ def list_suites() -> None:
 
 @app.command(name="status")
 def status(
-    suite: tuple[str, ...] = (), results_dir: Path = RESULTS, archives: Path = ARCHIVES
+    suite: tuple[str, ...] = (), results_dir: Path = RESULTS, archives: Path | None = None
 ) -> None:
     """Tell how far each suite is: runs done, running, failed, interrupted and pending.
 
@@ -162,9 +165,9 @@ def status(
     Args:
         suite: Names of suites; by default all.
         results_dir: Where the runs' folders are.
-        archives: Where archives of finished runs are.
+        archives: Where archives of finished runs are; by default docs/results of this checkout.
     """
-    store = Store(results_dir, archives)
+    store = Store(results_dir, archives or ARCHIVES)
     rows: dict[str, tuple[Counter[str], str]] = {}
     for name in suite or suite_names():
         plan = load_suite(name)
@@ -212,7 +215,7 @@ def evaluate(
             unseen themes.
         device: CoinRun: cpu, cuda or cuda:1; auto: a GPU if there is one.
     """
-    from harness.evaluation.runs import Settings, evaluate_run  # PyTorch and the simulators
+    from harness.evaluation.runs import evaluate_run  # PyTorch and the simulators
 
     if not run_dirs:
         raise EvaluationError("name at least one folder of a run, such as results/smoke/<run id>")
@@ -238,7 +241,7 @@ def evaluate(
 def archive(
     suite: Annotated[str, tyro.conf.Positional],
     results_dir: Path = RESULTS,
-    archives: Path = ARCHIVES,
+    archives: Path | None = None,
     total_timesteps: int | None = None,
     seeds: int | None = None,
     agents: int | None = None,
@@ -254,7 +257,8 @@ def archive(
     Args:
         suite: Name of a suite (see `list`), or path of a TOML file.
         results_dir: Where the runs' folders are.
-        archives: Where the files go, in a folder for each suite.
+        archives: Where the files go, in a folder for each suite; by default docs/results of this
+            checkout.
         total_timesteps: Environment steps of each run, as in `run-all`.
         seeds: So many seeds, as in `run-all`.
         agents: Only so many agents for each seed.
@@ -262,7 +266,8 @@ def archive(
         with_checkpoints: Write the final checkpoints too, to a ZIP file beside each.
     """
     plan = load_suite(suite, total_timesteps=total_timesteps, seeds=seeds, agents=agents, env=env)
-    for packed in pack(plan, Store(results_dir, archives), archives, with_checkpoints):
+    root = archives or ARCHIVES
+    for packed in pack(plan, Store(results_dir, root), root, with_checkpoints):
         say(packed.text, markup=False)
 
 
@@ -270,9 +275,10 @@ def archive(
 def report(
     suite: tuple[str, ...] = DEFAULT_SUITES,
     results_dir: Path = RESULTS,
-    archives: Path = ARCHIVES,
+    archives: Path | None = None,
     total_timesteps: int | None = None,
     seeds: int | None = None,
+    agents: int | None = None,
 ) -> None:
     """Report what the runs of suites show so far, beside the paper's tables.
 
@@ -280,12 +286,13 @@ def report(
         suite: Names of suites (see `list`), or paths of TOML files. Several make one page, with a
             part for each in this order.
         results_dir: Where the runs' folders are and the report goes.
-        archives: Where archives of finished runs are.
+        archives: Where archives of finished runs are; by default docs/results of this checkout.
         total_timesteps: The runs of so many steps each, as in `run-all`.
         seeds: So many seeds, as in `run-all`: the suite's first, then those that follow its last.
+        agents: Only so many agents for each seed, as in `run-all`.
     """
-    store = Store(results_dir, archives)
-    plans = load_suites(suite, total_timesteps=total_timesteps, seeds=seeds)
+    store = Store(results_dir, archives or ARCHIVES)
+    plans = load_suites(suite, total_timesteps=total_timesteps, seeds=seeds, agents=agents)
     show_verdicts(make_report([load_results(plan, store) for plan in plans.values()], store))
 
 

@@ -25,7 +25,7 @@ def refuse_extension(spec: RunSpec, store: Store) -> None:
         store.refuse_changed(spec)
 
     length = saved["args"]["total_timesteps"]
-    if not store.is_done(spec.with_args(total_timesteps=length)):
+    if not store.is_trained(spec.with_args(total_timesteps=length)):
         reason = f"it has not finished its {length} steps: run it with --total-timesteps {length}"
     else:
         reason = why_not(spec.baseline, saved["args"], spec.args["total_timesteps"])
@@ -59,9 +59,9 @@ def why_not(baseline: str, args: dict[str, Any], total_timesteps: int) -> str:
 
 def _refuse_archived(spec: RunSpec, store: Store) -> None:
     """A run that only an archive holds has no folder to go on in."""
-    for length, place in store.archives.lengths(spec).items():
-        if length < spec.args["total_timesteps"]:
-            raise StoreError(
-                f"{spec.run_id} cannot be extended: its {length} steps are in {place} only, "
-                "without the folder to go on in; without --extend it is run from the start"
-            )
+    for record in store.archives.shorter(spec):
+        raise StoreError(
+            f"{spec.run_id} cannot be extended: its {record.total_timesteps} steps are in "
+            f"{record.place} only, without the folder to go on in; without --extend it is run from "
+            "the start"
+        )

@@ -1,8 +1,9 @@
 """Which settings make two runs the same run.
 
-A run is its baseline, the baseline's version, every argument that decides its numbers, and how it
-is evaluated. Two runs are compared argument by argument: one that was made before a flag existed
-is taken with the flag's present default, so a new flag that changes nothing leaves old runs valid.
+A run is its baseline, the baseline's version and every argument that decides its numbers. Two runs
+are compared argument by argument: one that was made before a flag existed is taken with the flag's
+present default, so a new flag that changes nothing leaves old runs valid. How the trained agent is
+evaluated is no part of it: an evaluation can be made anew without training.
 """
 
 from __future__ import annotations
@@ -40,25 +41,25 @@ def resolve(baseline: str, args: dict[str, Any]) -> dict[str, Any]:
     return {name: _plain(value, name in floats) for name, value in found.items()}
 
 
-def identify(baseline: str, args: dict[str, Any], evaluation: dict[str, Any]) -> dict[str, Any]:
+def identify(baseline: str, args: dict[str, Any]) -> dict[str, Any]:
     """All that makes the run this run, as one flat dictionary."""
     free = getattr(module_of(baseline), "MAY_CHANGE", frozenset())
     deciding = {k: v for k, v in resolve(baseline, args).items() if k not in free}
-    return {"baseline": baseline, "version": version_of(baseline), **deciding, **evaluation}
+    return {"baseline": baseline, "version": version_of(baseline), **deciding}
 
 
 def compare(saved: dict[str, Any], now: dict[str, Any]) -> Changes:
     """How the run that `saved`, the content of a spec.json, tells of differs from the run `now`.
 
     Args:
-        saved: Its baseline, version, args and evaluation.
+        saved: Its baseline, version and args.
         now: A run as `identify` gives it.
     """
     if saved["baseline"] != now["baseline"]:
         return {"baseline": (saved["baseline"], now["baseline"])}
 
     baseline = saved["baseline"]
-    then = identify(baseline, saved["args"], saved.get("evaluation", {}))
+    then = identify(baseline, saved["args"])
     then["version"] = saved.get("version", 1)
 
     pairs = {name: (then.get(name), now.get(name)) for name in {**then, **now}}

@@ -6,8 +6,14 @@ import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
-from harness.archive import archive_path, checkpoints_path, write_archive, write_checkpoints
-from harness.files import StoreError, checksum
+from harness.archive import (
+    archive_path,
+    checkpoints_path,
+    names_in,
+    write_archive,
+    write_checkpoints,
+)
+from harness.files import checksum
 from harness.record import Record
 from harness.store import Store
 from harness.suite import RunSpec, Suite
@@ -24,14 +30,20 @@ class Packed:
     """runs that are not finished yet: then nothing is written"""
     path: Path | None
     """the file that was written, if one was"""
+    without: tuple[str, ...] = ()
+    """ids of runs whose checkpoints were asked for and are not in the results folder"""
 
     @property
     def text(self) -> str:
         if self.missing:
             return f"{self.about}: {self.missing} of {self.runs} runs are not finished"
         if self.path is None:
-            return f"{self.about}: archived before"
-        return f"{self.about}: {self.path}, {self.path.stat().st_size / 1024:.0f} KiB"
+            text = f"{self.about}: archived before"
+        else:
+            text = f"{self.about}: {self.path}, {self.path.stat().st_size / 1024:.0f} KiB"
+        if self.without:
+            text += f"; no checkpoints, since those of {', '.join(self.without)} are not here"
+        return text
 
 
 def pack(plan: Suite, store: Store, root: Path, with_checkpoints: bool) -> Iterator[Packed]:
@@ -44,44 +56,74 @@ def pack(plan: Suite, store: Store, root: Path, with_checkpoints: bool) -> Itera
     kinds: dict[tuple[str, str, str], list[RunSpec]] = {}
     for spec in plan.runs:
         kinds.setdefault((spec.suite, spec.algorithm, spec.environment), []).append(spec)
+
     for (_, algorithm, environment), specs in kinds.items():
         about = f"{algorithm} on {environment}"
         missing = sum(not store.is_done(spec) for spec in specs)
-        path = None if missing else _pack(specs, store, root, with_checkpoints)
-        yield Packed(about, len(specs), missing, path)
+        if missing:
+            yield Packed(about, len(specs), missing, None)
+            continue
+        path, held = _pack(specs, store, root)
+        without = _pack_checkpoints(held, store) if with_checkpoints else []
+        yield Packed(about, len(specs), 0, path, tuple(without))
 
 
-def _pack(specs: list[RunSpec], store: Store, root: Path, with_checkpoints: bool) -> Path | None:
-    """Write the runs, and the shorter ones that they continue, that no archive holds yet."""
+def _pack(
+    specs: list[RunSpec], store: Store, root: Path
+) -> tuple[Path | None, dict[Path, list[RunSpec]]]:
+    """Write the runs, and the shorter ones that they continue, that no archive holds yet.
+
+    Returns:
+        The file that was written, if any, and which file holds which of the runs.
+    """
     path = archive_path(root, specs[0])
     fresh: list[Record] = []
-    held: dict[Path, list[RunSpec]] = {}  # which file holds which of the runs
+    held: dict[Path, list[RunSpec]] = {}
     for spec in specs:
         archived = store.archives.find(spec)
         record = store.record(spec)
         if archived is None and record is not None:
-            _verify(spec, record, store)
+            store.verify(spec, tuple(record.files))
             fresh.append(record)
         held.setdefault(archived.place if archived else path, []).append(spec)
         fresh += _shorter(spec, store)
 
     if fresh:
         write_archive(path, fresh)
-    if with_checkpoints:
-        for place, found in held.items():
-            if not checkpoints_path(place).exists():
-                write_checkpoints(place, _checkpoints(found, store))
-    return path if fresh else None
+    return (path if fresh else None), held
 
 
-def _checkpoints(specs: list[RunSpec], store: Store) -> dict[str, Path]:
-    """The final checkpoint of each run, by run id; a run that was extended since has another."""
-    found = {}
-    for spec in specs:
-        record, path = store.record(spec), store.path(spec, "checkpoint.pt")
-        if record and path.exists() and checksum(path) == record.files.get("checkpoint.pt"):
-            found[spec.run_id] = path
-    return found
+def _pack_checkpoints(held: dict[Path, list[RunSpec]], store: Store) -> list[str]:
+    """Write the checkpoints of each archive's runs, all of them or none.
+
+    Returns:
+        The ids of runs whose checkpoints are missing.
+    """
+    without: list[str] = []
+    for place, specs in held.items():
+        target = checkpoints_path(place)
+        wanted = [spec for spec in specs if "checkpoint.pt" in _files(spec, store)]
+        if target.exists() and {spec.run_id for spec in wanted} <= names_in(target):
+            continue
+        missing = [spec.run_id for spec in wanted if not _has_checkpoint(spec, store)]
+        if missing:
+            without += missing
+        else:
+            paths = {spec.run_id: store.path(spec, "checkpoint.pt") for spec in wanted}
+            write_checkpoints(place, paths)
+    return without
+
+
+def _files(spec: RunSpec, store: Store) -> dict[str, str]:
+    """Checksums of what the finished run left; one that diverged early left no checkpoint."""
+    record = store.record(spec)
+    return record.files if record else {}
+
+
+def _has_checkpoint(spec: RunSpec, store: Store) -> bool:
+    """Whether its folder has its final checkpoint; a run that was extended since has another."""
+    path = store.path(spec, "checkpoint.pt")
+    return path.exists() and checksum(path) == _files(spec, store)["checkpoint.pt"]
 
 
 def _shorter(spec: RunSpec, store: Store) -> list[Record]:
@@ -94,16 +136,3 @@ def _shorter(spec: RunSpec, store: Store) -> list[Record]:
         if record is not None and store.archives.find(before) is None:
             found.append(record)
     return found
-
-
-def _verify(spec: RunSpec, record: Record, store: Store) -> None:
-    """Raise StoreError if a file is not the one that the run ended with."""
-    if record.total_timesteps in store.shorter_lengths(spec):
-        return  # it has been continued since: its metrics are the first rows of a longer file
-    for name, expected in record.files.items():
-        path = store.path(spec, name)
-        if not path.exists() or checksum(path) != expected:
-            raise StoreError(
-                f"{path} is not the file that the run ended with: remove {path.parent} to run it "
-                "again"
-            )

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from harness.identity import Changes, compare, make_args
-from harness.scores import SPEED
+from harness.scores import SPEED, VERSION
 from harness.statistics.scores import EPISODES
 from harness.suite import RunSpec
 
@@ -41,6 +41,8 @@ class Record:
     """evaluation.csv: every row"""
     asked: dict[str, Any] | None = None
     """evaluation.json: what the evaluation was asked for"""
+    scores_version: int = VERSION
+    """of the definitions that the scores were computed by"""
 
     @property
     def total_timesteps(self) -> int:

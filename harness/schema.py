@@ -8,17 +8,16 @@ import tomllib
 import types
 import typing
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import gymnasium as gym
 
+from harness.evaluation.settings import CONTROL, LEVELS, Unseen
 from harness.identity import make_args
 
 SUITES = Path(__file__).parent / "suites"
 RUNS = {"seeds", "agents", "args", "algorithms", "environments"}
 KEYS = RUNS | {"title", "note", "figures", "sweeps", "evaluation", "include"}
-Unseen = Literal["next", "unbounded", "themes"]
-"""what CoinRun levels are that an agent never saw: harness.evaluation.levels says more"""
 
 
 class SuiteError(ValueError):
@@ -67,13 +66,11 @@ def check_keys(given: dict[str, Any], needed: set[str], known: set[str], where: 
 
 def check_evaluation(given: dict[str, Any], where: str) -> None:
     """Raise SuiteError unless it is that of control agents, or that of CoinRun's."""
-    control = {"episodes"}
-    levels = {"levels", "repeats", "unseen"}
-    check_known(given, control | levels, f"{where}: key")
+    check_known(given, {*CONTROL, *LEVELS}, f"{where}: key")
     if "episodes" in given:
-        check_keys(given, control, control, where)
+        check_keys(given, set(CONTROL), set(CONTROL), where)
     else:
-        check_keys(given, levels - {"unseen"}, levels, where)
+        check_keys(given, set(LEVELS) - {"unseen"}, set(LEVELS), where)
 
     if not fits(given.get("unseen", "next"), Unseen):
         known = " or ".join(typing.get_args(Unseen))

@@ -18,6 +18,7 @@ from harness.statistics.scores import (
     window_of,
 )
 
+VERSION = 1  # raised when a score's definition changes: archives keep scores, not every row
 SPEED = "charts/SPS"  # columns that begin so differ each time that a run is run
 
 

@@ -16,7 +16,7 @@ import io
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ import pandas as pd
 
 from harness import provenance
 from harness.archive import Archives, refuse_two
+from harness.evaluation.settings import answers
 from harness.files import StoreError, checksum, read_json, write_json
 from harness.identity import Changes, compare, describe
 from harness.record import Record
@@ -33,10 +34,6 @@ from harness.suite import RunSpec
 FINISHED = ("done", "diverged")
 STATES = (*FINISHED, "running", "failed", "interrupted", "pending", "changed")
 DIVERGED = 3  # exit status of a run that ends itself, since its own numbers became non-finite
-
-
-class EvaluationError(RuntimeError):
-    """A run that cannot be evaluated, and why."""
 
 
 class Store:
@@ -75,11 +72,28 @@ class Store:
         return self._finished(spec) is not None
 
     def _finished(self, spec: RunSpec) -> str | None:
-        done = read_json(self.kept(spec, "done.json"))
-        if done is not None and not self.changes(spec):
-            return done.get("state", "done")
+        if self.is_trained(spec) and self.is_evaluated(spec):
+            return self._done(spec).get("state", "done")
         archived = self.archives.find(spec)
         return archived.state if archived else None
+
+    def is_trained(self, spec: RunSpec) -> bool:
+        """Whether the folder's run has come to its end, however it was evaluated."""
+        return bool(self._done(spec)) and not self.changes(spec)
+
+    def is_evaluated(self, spec: RunSpec) -> bool:
+        """Whether the folder's run was evaluated as it is asked for now.
+
+        One that has been extended since keeps the evaluation that it has: its agent is gone.
+        """
+        if self.path(spec, _shorter("done.json", spec.args["total_timesteps"])).exists():
+            return True
+        saved = self.saved(spec) or {}
+        return answers(saved.get("evaluation", {}), spec.evaluation)
+
+    def _done(self, spec: RunSpec) -> dict[str, Any]:
+        """The content of done.json; empty where there is none."""
+        return read_json(self.kept(spec, "done.json")) or {}
 
     def kept(self, spec: RunSpec, name: str) -> Path:
         """The file as the run of this length left it, if it has been extended since."""
@@ -96,7 +110,7 @@ class Store:
         if not self.is_done(spec) and (changes := self.changes(spec)):
             raise StoreError(
                 f"{self.path(spec)} was run with another configuration ({describe(changes)}): "
-                "name another --results-dir, or remove it"
+                f"{_advice(changes)}"
             )
 
     def members(self, spec: RunSpec) -> list[int]:
@@ -139,6 +153,8 @@ class Store:
         """Say what is about to run, before it does; of a group, the first has the log."""
         self.path(spec).mkdir(parents=True, exist_ok=True)
         self._keep_shorter(spec)
+        if not self.is_evaluated(spec):
+            self.path(spec, "done.json").unlink(missing_ok=True)
         self.path(spec, "failed.json").unlink(missing_ok=True)
 
         agents = [run.args["agent"] for run in group]
@@ -243,11 +259,16 @@ class Store:
         return own or archived
 
     def own_record(self, spec: RunSpec) -> Record | None:
-        """The finished run, if the folder holds it."""
-        done = read_json(self.kept(spec, "done.json"))
+        """The finished run, if the folder holds it.
+
+        Raises:
+            StoreError: A file that it is read from is not the one that the run ended with.
+        """
+        done = self._done(spec)
         saved = read_json(self.kept(spec, "spec.json"))
-        if done is None or saved is None or self.changes(spec):
+        if saved is None or not self.is_trained(spec) or not self.is_evaluated(spec):
             return None
+        self.verify(spec, ("metrics.csv", "evaluation.csv"))
         metrics = self.metrics(spec)
         evaluation = self.kept(spec, "evaluation.csv")
         return Record(
@@ -261,6 +282,23 @@ class Store:
             evaluation=pd.read_csv(evaluation) if evaluation.exists() else None,
             asked=read_json(self.kept(spec, "evaluation.json")),
         )
+
+    def verify(self, spec: RunSpec, names: Sequence[str]) -> None:
+        """Raise StoreError if one of a finished run's files is not the one that it ended with.
+
+        Of a run that has been extended since, only the evaluation is still a file of its own.
+        """
+        was_extended = spec.args["total_timesteps"] in self.shorter_lengths(spec)
+        expected = self._done(spec).get("sha256", {})
+        for name in expected.keys() & names:
+            if was_extended and name != "evaluation.csv":
+                continue
+            path = self.kept(spec, name)
+            if not path.exists() or checksum(path) != expected[name]:
+                raise StoreError(
+                    f"{path} is {'damaged' if path.exists() else 'gone'}: it is not the file that "
+                    f"the run ended with. Restore it, or remove {path.parent} to run it again"
+                )
 
     def steps(self, spec: RunSpec) -> int:
         """Environment steps done, cheaply: from the last whole line of metrics.csv."""
@@ -281,6 +319,14 @@ class Store:
         except FileNotFoundError:
             return "(no log)"
         return "\n".join(text.splitlines()[-lines:])
+
+
+def _advice(changes: Changes) -> str:
+    """What to do where a folder holds a run of another configuration."""
+    before, now = changes.get("total_timesteps", (0, 0))
+    if set(changes) == {"total_timesteps"} and now > before:
+        return f"add --extend to continue it to {now} steps, or name another --results-dir"
+    return "name another --results-dir, or move it away"
 
 
 def _shorter(name: str, total_timesteps: int) -> str:

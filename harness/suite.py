@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from harness.evaluation.settings import resolve as resolve_evaluation
 from harness.identity import identify, resolve
 from harness.schema import SuiteError, check_args, check_keys, check_known, fits, read
 
@@ -33,8 +34,8 @@ class RunSpec:
     args: dict[str, Any]
     """of the baseline: env_id, seed, agent, total_timesteps, and what the suite sets"""
     evaluation: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """how the trained agent is evaluated: episodes of a control agent, levels and repeats of one on
-    CoinRun; empty if it is not"""
+    """how the trained agent is evaluated, defaults included: episodes of a control agent, levels,
+    repeats and unseen of one on CoinRun; empty if it is not"""
 
     @property
     def run_id(self) -> str:
@@ -49,7 +50,7 @@ class RunSpec:
     @functools.cached_property
     def identity(self) -> dict[str, Any]:
         """All that decides the run's numbers: see harness.identity."""
-        return identify(self.baseline, self.args, self.evaluation)
+        return identify(self.baseline, self.args)
 
     @property
     def hash(self) -> str:
@@ -268,7 +269,7 @@ def _runs(algorithm: dict[str, Any], data: dict[str, Any], path: Path) -> list[R
                 environment=environment,
                 baseline=algorithm["baseline"],
                 args={**args, "seed": seed, "agent": agent},
-                evaluation=data.get("evaluation", {}),
+                evaluation=resolve_evaluation(algorithm["baseline"], data.get("evaluation", {})),
             )
             for seed in data["seeds"]
             for agent in range(data["agents"])

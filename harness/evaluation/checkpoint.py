@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from harness.store import EvaluationError
+from harness.evaluation.settings import EvaluationError
 
 BASELINES = ("ppo_reg", "trpo_reg", "ppo_reg_coinrun")
 """whose checkpoints can be evaluated; a population's are its single file's"""

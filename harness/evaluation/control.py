@@ -19,8 +19,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from torch import nn
 
 from harness.evaluation.checkpoint import Checkpoint
+from harness.evaluation.settings import EvaluationError
 from harness.evaluation.smoothness import action_change, smoothness
-from harness.store import EvaluationError
 
 POLICIES = ("deterministic", "sampled")
 COLUMNS = ["policy", "episode", "return", "length", "action_change", "smoothness"]

@@ -21,8 +21,7 @@ from PIL import Image
 
 from baselines.ppo_reg_coinrun import Agent, Args, RunError, find_device, make_env, play
 from harness.evaluation.checkpoint import Checkpoint
-from harness.schema import Unseen
-from harness.store import EvaluationError
+from harness.evaluation.settings import EvaluationError, Unseen
 
 POOLS = 16  # levels played at a time
 MAX_SEED = 2**31 - 1

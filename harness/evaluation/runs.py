@@ -11,33 +11,8 @@ import pandas as pd
 
 from harness.evaluation import control, levels
 from harness.evaluation.checkpoint import Checkpoint, read_checkpoint
-from harness.schema import Unseen
-from harness.store import EvaluationError, read_json, write_json
-
-CONTROL = ("episodes",)
-LEVELS = ("levels", "repeats", "unseen")
-
-
-@dataclasses.dataclass(frozen=True)
-class Settings:
-    """What an evaluation asks for; a run takes what is for its kind."""
-
-    episodes: int = 20
-    """control: episodes with the policy's mean, and as many with sampled actions"""
-    levels: int = 500
-    """CoinRun: levels of each kind"""
-    repeats: int = 20
-    """CoinRun: episodes with sampled actions on each level"""
-    unseen: Unseen = "next"
-    """CoinRun: what the levels are that the agent never saw"""
-    device: str = "auto"
-    """CoinRun: where the network is; a control agent's is on the CPU"""
-
-    def __post_init__(self) -> None:
-        for name in ("episodes", "levels", "repeats"):
-            if getattr(self, name) < 1:
-                raise EvaluationError(f"{name} must be at least 1, got {getattr(self, name)}")
-
+from harness.evaluation.settings import LEVELS, EvaluationError, Settings, names_for
+from harness.files import read_json, write_json
 
 Show = Callable[[Iterable[pd.DataFrame], int], Iterable[pd.DataFrame]]
 
@@ -56,8 +31,8 @@ def evaluate_run(
         show: Passes parts of the work on, and may show how many of the total are done.
     """
     checkpoint = read_checkpoint(path)
-    of_levels = checkpoint.baseline == "ppo_reg_coinrun"
-    asked = ask(checkpoint, settings, LEVELS if of_levels else CONTROL)
+    names = names_for(checkpoint.baseline)
+    asked = ask(checkpoint, settings, names)
     about = {**asked, "checkpoint_sha256": checkpoint.sha256}
     before = read_json(path / "evaluation.json") or {}
     if before == about and (path / "evaluation.csv").exists():
@@ -68,7 +43,7 @@ def evaluate_run(
         raise EvaluationError(
             f"{path} is a suite's run, evaluated with {known}: copy it to evaluate it otherwise"
         )
-    if of_levels:
+    if names == LEVELS:
         episodes = levels.evaluate(checkpoint, **asked, device=settings.device, show=show)
     else:
         parts = control.evaluate(checkpoint, settings.episodes)

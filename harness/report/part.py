@@ -57,9 +57,10 @@ class Part:
 
     @property
     def warnings(self) -> list[str]:
-        """What mixes among the runs that are compared: control tasks and CoinRun by themselves."""
+        """What cannot be read, and what mixes: control tasks and CoinRun by themselves."""
         parts = [self.results.part(evaluated) for evaluated in (False, True)]
-        return list(dict.fromkeys(warning for part in parts for warning in part.origins.warnings))
+        mixing = [warning for part in parts for warning in part.origins.warnings]
+        return list(dict.fromkeys([*self.results.warnings, *mixing]))
 
     @property
     def diverged(self) -> list[tuple[str, str]]:

@@ -8,11 +8,13 @@ from typing import Any
 
 import pandas as pd
 
+from harness.evaluation.settings import answers
+from harness.files import StoreError
 from harness.provenance import Origins, find_origins
 from harness.record import Record, thin
-from harness.scores import exact_scores
+from harness.scores import VERSION, exact_scores
 from harness.store import Store
-from harness.suite import Suite
+from harness.suite import RunSpec, Suite
 
 TIMED = "cost.csv"  # in the results' folder
 
@@ -39,6 +41,8 @@ class Results:
     """content of each run's spec.json, by run id"""
     scores: dict[str, dict[str, float]] = dataclasses.field(default_factory=dict)
     """exact numbers from every row, as `harness.scores` names them; also of runs under way"""
+    warnings: list[str] = dataclasses.field(default_factory=list)
+    """sentences about runs that cannot be read or must not be mixed with the others"""
     timed: pd.DataFrame | None = None
     """what `python -m harness cost` has measured, if it has"""
 
@@ -98,18 +102,27 @@ class Results:
 def load_results(suite: Suite, store: Store) -> Results:
     """Read what there is, here and in archives; runs may be unfinished, or still be running.
 
+    A run whose files are damaged is left out and named.
+
     Raises:
         ArchiveError: An archive is damaged, or holds another outcome of a run than another place.
     """
-    records = {run.run_id: record for run in suite.runs if (record := store.record(run))}
+    records: dict[str, Record] = {}
+    damaged: dict[str, str] = {}
+    for run in suite.runs:
+        try:
+            if record := store.record(run):
+                records[run.run_id] = record
+        except StoreError as error:
+            damaged[run.run_id] = f"{error}."
     metrics = {run_id: record.curves for run_id, record in records.items() if len(record.curves)}
     scores = {run_id: records[run_id].scores for run_id in metrics}
     specs = {run_id: record.spec for run_id, record in records.items()}
     changed = []
     for run in suite.runs:
-        if run.run_id in records:
+        if run.run_id in records or run.run_id in damaged:
             continue
-        if store.changes(run) or store.archives.others(run):
+        if store.changes(run) or (not store.saved(run) and store.archives.others(run)):
             changed.append(run.run_id)
         elif (found := store.metrics(run)) is not None:
             metrics[run.run_id] = found
@@ -117,7 +130,14 @@ def load_results(suite: Suite, store: Store) -> Results:
             specs[run.run_id] = store.saved(run) or {}
 
     diverged = {k: x.done["diverged"] for k, x in records.items() if x.state == "diverged"}
-    evaluations = {k: r.evaluation for k, r in records.items() if r.evaluation is not None}
+    otherwise = {
+        run.run_id for run in suite.runs if run.run_id in records and not _as_asked(run, records)
+    }
+    evaluations = {
+        run_id: record.evaluation
+        for run_id, record in records.items()
+        if record.evaluation is not None and run_id not in otherwise
+    }
     timed = store.root / TIMED
     return Results(
         suite=suite,
@@ -129,8 +149,31 @@ def load_results(suite: Suite, store: Store) -> Results:
         evaluations=evaluations,
         folders={run.run_id: store.path(run) for run in suite.runs},
         specs=specs,
+        warnings=[*damaged.values(), *_warnings(records, otherwise)],
         timed=pd.read_csv(timed) if timed.exists() else None,
     )
+
+
+def _as_asked(run: RunSpec, records: dict[str, Record]) -> bool:
+    """Whether a run, which may be archived, was evaluated as the suite asks for now, if it does."""
+    return answers(records[run.run_id].spec.get("evaluation", {}), run.evaluation)
+
+
+def _warnings(records: dict[str, Record], otherwise: set[str]) -> list[str]:
+    """What a reader must know of runs whose numbers cannot stand beside the others'."""
+    found = []
+    if otherwise:
+        found.append(
+            f"{len(otherwise)} archived runs were evaluated otherwise than the suite asks for now: "
+            f"their evaluations are left out ({', '.join(sorted(otherwise))})."
+        )
+    old = sorted(k for k, record in records.items() if record.scores_version != VERSION)
+    if old:
+        found.append(
+            f"{len(old)} archived runs have scores by other definitions than today's: "
+            f"{', '.join(old)}."
+        )
+    return found
 
 
 def _alike(

@@ -51,6 +51,7 @@ def run_cli(monkeypatch, capsys, tmp_path):
     Gives its exit status and output.
     """
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cli, "ARCHIVES", tmp_path / "archives")
 
     def run(*words: object) -> tuple[int, str]:
         monkeypatch.setattr(sys, "argv", ["harness", *map(str, words)])

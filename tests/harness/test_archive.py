@@ -16,6 +16,7 @@ from harness.archive import (
     ArchiveError,
     Archives,
     checkpoints_path,
+    names_in,
     read_archive,
     read_checkpoint,
     write_archive,
@@ -232,7 +233,7 @@ def test_files_that_changed_since_the_run_ended_are_not_archived(store, suite, r
     finish(runs)
     path = store.path(runs[2], "metrics.csv")
     path.write_bytes(path.read_bytes().replace(b"100,", b"101,", 1))
-    with pytest.raises(StoreError, match=r"s2__a0/metrics\.csv is not the file that the run"):
+    with pytest.raises(StoreError, match=r"s2__a0/metrics\.csv is damaged"):
         packed(suite, store, root)
     assert not root.exists()
 
@@ -267,7 +268,9 @@ def test_the_shorter_run_of_an_extended_one_is_archived_too(store, suite, runs, 
     archives = Archives(root)
     assert archives.find(short).scores == scores
     assert archives.find(long).scores == store.record(long).scores != scores
-    assert archives.lengths(long).keys() == {25_000, 50_000}
+    assert [record.total_timesteps for record in archives.shorter(long)] == [25_000]
+    assert archives.shorter(short) == []
+    assert archives.shorter(long.with_args(gamma=0.9)) == []  # another run altogether
 
 
 def test_a_checkpoint_of_a_longer_run_is_not_taken_for_the_shorter_ones(store, suite, runs, root):
@@ -278,8 +281,29 @@ def test_a_checkpoint_of_a_longer_run_is_not_taken_for_the_shorter_ones(store, s
     packed(dataclasses.replace(suite, runs=[short]), store, root, with_checkpoints=True)
     (record,) = read_archive(root / "tiny" / "ppo__Hopper.jsonl.xz")
     assert record.total_timesteps == 25_000
+    assert files(root) == ["ppo__Hopper.jsonl.xz"]
     with pytest.raises(ArchiveError, match="holds no checkpoint of ppo__Hopper__s1__a0"):
         read_checkpoint(record)
+
+
+def test_checkpoints_are_all_there_or_none(store, suite, runs, root, finish):
+    finish(runs)
+    packed(suite, store, root)
+    path = store.path(runs[1], "checkpoint.pt")
+    content = path.read_bytes()
+    path.unlink()
+    again = Store(store.root, root)
+    text = packed(suite, again, root, with_checkpoints=True)[0]
+    assert text.endswith(f"no checkpoints, since those of {runs[1].run_id} are not here")
+    assert files(root) == ["ppo__Hopper.jsonl.xz"]
+
+    path.write_bytes(content)
+    packed(suite, again, root, with_checkpoints=True)
+    target = root / "tiny" / "ppo__Hopper.checkpoints.zip"
+    assert names_in(target) == {spec.run_id for spec in runs}
+    target.write_bytes(target.read_bytes()[:50])  # as a kill of an older version left it
+    packed(suite, again, root, with_checkpoints=True)
+    assert names_in(target) == {spec.run_id for spec in runs}
 
 
 # --- in place of the runs ------------------------------------------------------------------------
@@ -322,6 +346,32 @@ def test_an_archive_of_other_settings_does_not_count(elsewhere, runs, suite):
     assert other.run_id not in results.metrics
     longer = runs[0].with_args(total_timesteps=300)
     assert load_results(dataclasses.replace(suite, runs=[longer]), elsewhere).changed == []
+
+
+def test_a_run_under_way_is_seen_beside_an_archive_of_other_settings(elsewhere, runs, suite):
+    other = runs[0].with_args(gamma=0.5)
+    write_run(elsewhere, other, [1.0, 2.0], done=False)
+    results = load_results(dataclasses.replace(suite, runs=[other, *runs[1:]]), elsewhere)
+    assert results.changed == []
+    assert len(results.metrics[other.run_id]) == 2
+
+
+def test_an_archived_run_counts_as_done_however_it_was_evaluated(elsewhere, runs, suite):
+    asked = [dataclasses.replace(spec, evaluation={"episodes": 20}) for spec in runs]
+    assert {elsewhere.state(spec) for spec in asked} == {"done"}
+    results = load_results(dataclasses.replace(suite, runs=asked), elsewhere)
+    assert results.evaluations == {}
+    (warning,) = results.warnings
+    assert warning.startswith("4 archived runs were evaluated otherwise than the suite asks for")
+
+
+def test_scores_by_other_definitions_are_told(store, runs, root, finish, suite, tmp_path):
+    finish(runs)
+    old = [dataclasses.replace(store.record(spec), scores_version=0) for spec in runs]
+    write_archive(root / "tiny" / "ppo__Hopper.jsonl.xz", old)
+    results = load_results(suite, Store(tmp_path / "nothing", root))
+    (warning,) = results.warnings
+    assert warning.startswith("4 archived runs have scores by other definitions than today's")
 
 
 def test_the_results_folder_wins_where_both_hold_the_same(store, archive, runs, suite, root):

@@ -105,6 +105,30 @@ def test_the_last_lines_are_the_verdicts_and_the_page(run_cli, store, two_files)
     assert "Single" not in out  # single agents have no table here: the page has it
 
 
+def test_another_evaluation_is_made_without_training_anew(run_cli, store, suite_file):
+    words = ["--suite", suite_file, "--results-dir", store.root, "--jobs", 2]
+    words += ["--env", "Hopper", "--seeds", 1]
+    text = suite_file.read_text()
+    suite_file.write_text(f"{text}\n[evaluation]\nepisodes = 1\n")
+    status, out = run_cli("run-all", *words)
+    assert status == 0, out
+    specs = load_suite(str(suite_file), seeds=1, env=("Hopper",)).runs
+    trained = [store.path(spec, "checkpoint.pt").read_bytes() for spec in specs]
+    first = [pd.read_csv(store.path(spec, "evaluation.csv")) for spec in specs]
+    assert [len(found) for found in first] == [2, 2, 2, 2]
+
+    suite_file.write_text(f"{text}\n[evaluation]\nepisodes = 2\n")
+    status, out = run_cli("run-all", *words)
+    assert status == 0, out
+    assert "0 done before, 4 to do" in out
+    assert [store.path(spec, "checkpoint.pt").read_bytes() for spec in specs] == trained
+    for spec, before in zip(specs, first, strict=True):
+        found = pd.read_csv(store.path(spec, "evaluation.csv"))
+        assert len(found) == 4
+        pd.testing.assert_frame_equal(found[found["episode"] == 0].reset_index(drop=True), before)
+    assert "4 done before, 0 to do" in run_cli("run-all", *words)[1]
+
+
 def test_a_suite_without_the_tasks_that_are_asked_for_is_left_out(run_cli, store, two_files):
     other = two_files[1]
     other.write_text(other.read_text().replace('Hopper = "Pendulum-v1"', ""))

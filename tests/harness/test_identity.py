@@ -32,14 +32,13 @@ def toy(monkeypatch):
     identity._fields.cache_clear()
 
 
-def saved(args=None, version: int = 1, **evaluation) -> dict:
+def saved(args=None, version: int = 1) -> dict:
     """The spec.json of a run of the toy with these arguments."""
-    content = {"baseline": "toy", "version": version, "evaluation": evaluation}
-    return {**content, "args": resolve("toy", args or {})}
+    return {"baseline": "toy", "version": version, "args": resolve("toy", args or {})}
 
 
-def changes(spec: dict, args=None, **evaluation) -> dict:
-    return compare(spec, identify("toy", args or {}, evaluation))
+def changes(spec: dict, args=None) -> dict:
+    return compare(spec, identify("toy", args or {}))
 
 
 def test_arguments_are_resolved_with_the_baselines_defaults():
@@ -92,23 +91,20 @@ def test_what_may_change_when_a_run_is_resumed_is_no_part_of_it(toy):
     before = saved()
     toy(gamma=0.9, run_dir="b", may_change={"run_dir"})
     assert changes(before) == {}
-    assert identify("toy", {}, {}) == {"baseline": "toy", "version": 1, "gamma": 0.9}
+    assert identify("toy", {}) == {"baseline": "toy", "version": 1, "gamma": 0.9}
 
 
 def test_precision_is_part_of_a_run_and_the_folder_and_the_logs_are_not():
-    coinrun = identify("ppo_reg_coinrun", {}, {})
+    coinrun = identify("ppo_reg_coinrun", {})
     assert {"bf16", "compile"} <= coinrun.keys()
-    assert "compile" in identify("ppo_reg", {}, {})
+    assert "compile" in identify("ppo_reg", {})
     both = {"run_dir", "resume", "track", "capture_video"}
-    assert not both & (coinrun.keys() | identify("ppo_reg", {}, {}).keys())
+    assert not both & (coinrun.keys() | identify("ppo_reg", {}).keys())
 
 
-def test_an_evaluation_and_a_baseline_are_compared_too(toy):
+def test_another_baseline_is_the_one_change(toy):
     toy(gamma=0.9)
-    before = saved(levels=2)
-    assert changes(before, levels=3) == {"levels": (2, 3)}
-    assert changes(before) == {"levels": (2, None)}
-    other = compare(before, identify("ppo_reg", {}, {}))
+    other = compare(saved(), identify("ppo_reg", {}))
     assert other == {"baseline": ("toy", "ppo_reg")}
     assert describe({"levels": (2, 3), "gamma": (0.9, 0.8)}) == "levels 2 -> 3, gamma 0.9 -> 0.8"
 

@@ -11,6 +11,7 @@ import pytest
 
 from baselines import ppo_reg
 from harness.archive import ArchiveError, archive_path, write_archive
+from harness.report.results import load_results
 from harness.scores import exact_scores
 from harness.store import DIVERGED, Store, StoreError, write_json
 from tests.harness.conftest import make_episodes, write_run
@@ -76,17 +77,65 @@ def test_another_configuration_is_not_taken_for_a_finished_run(store, suite):
         store.refuse_changed(changed)
 
 
-def test_another_evaluation_is_another_configuration_and_is_named(store, suite):
-    spec = dataclasses.replace(suite.runs[0], evaluation={"levels": 2, "repeats": 3})
-    episodes = make_episodes(seen_sampled=[[1.0]])
-    write_run(store, spec, [1.0], episodes=episodes)
+def test_a_run_that_was_evaluated_otherwise_is_trained_but_not_done(store, suite):
+    spec = dataclasses.replace(suite.runs[0], evaluation={"episodes": 2})
+    write_run(store, spec, [1.0])
     assert store.state(spec) == "done"
-    assert json.loads(store.path(spec, "spec.json").read_text())["evaluation"] == spec.evaluation
-    other = dataclasses.replace(spec, evaluation={"levels": 5, "repeats": 3})
-    with pytest.raises(StoreError, match=r"another configuration \(levels 2 -> 5\)"):
-        store.refuse_changed(other)
-    with pytest.raises(StoreError, match=r"\(levels 2 -> None, repeats 3 -> None\)"):
-        store.refuse_changed(suite.runs[0])
+    assert json.loads(store.path(spec, "spec.json").read_text())["evaluation"] == {"episodes": 2}
+
+    other = dataclasses.replace(spec, evaluation={"episodes": 3})
+    store.refuse_changed(other)
+    assert (store.state(other), store.is_trained(other)) == ("interrupted", True)
+    assert store.own_record(other) is None
+
+    store.start(other, ["true"], [other])  # before anything else is written, it is done no more
+    assert store.state(other) == store.state(spec) == "interrupted"
+    store.finish(other, returncode=0, seconds=1.0)
+    assert (store.state(other), store.state(spec)) == ("done", "interrupted")
+
+
+def test_a_run_that_was_extended_since_keeps_the_evaluation_that_it_has(store, suite):
+    short = dataclasses.replace(suite.runs[0], evaluation={"episodes": 2})
+    long = short.with_args(total_timesteps=400)
+    write_run(store, short, [1.0])
+    write_run(store, long, [1.0, 2.0])
+    otherwise = dataclasses.replace(short, evaluation={"episodes": 3})
+    assert store.state(otherwise) == "done"  # its agent is gone
+    assert store.state(otherwise.with_args(total_timesteps=400)) == "interrupted"
+
+
+def test_a_damaged_file_is_named_and_costs_one_run(store, suite):
+    first, second, *_ = suite.runs
+    write_run(store, first, [1.0, 2.0])
+    write_run(store, second, [1.0, 2.0])
+    path = store.path(first, "metrics.csv")
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"2.0", b"3.0", 1))
+
+    with pytest.raises(StoreError, match=rf"{first.run_id}/metrics\.csv is damaged"):
+        store.own_record(first)
+    results = load_results(suite, store)
+    assert results.done == [second.run_id]
+    assert list(results.metrics) == [second.run_id]
+    (warning,) = results.warnings
+    assert f"{first.run_id}/metrics.csv is damaged" in warning
+
+    path.unlink()
+    with pytest.raises(StoreError, match=r"metrics\.csv is gone"):
+        store.own_record(first)
+    path.write_bytes(content)
+    assert store.own_record(first) is not None
+
+
+def test_advice_for_another_length_is_to_extend(store, suite):
+    spec = suite.runs[0]
+    write_run(store, spec, [1.0])
+    with pytest.raises(StoreError, match=r"200 -> 400\): add --extend to continue it to 400 steps"):
+        store.refuse_changed(spec.with_args(total_timesteps=400))
+    with pytest.raises(StoreError, match=r"200 -> 100\): name another --results-dir"):
+        store.refuse_changed(spec.with_args(total_timesteps=100))
+    with pytest.raises(StoreError, match=r"gamma 0\.99 -> 0\.9\): name another --results-dir"):
+        store.refuse_changed(spec.with_args(total_timesteps=400, gamma=0.9))
 
 
 def test_another_baseline_is_named(store, suite):

@@ -87,7 +87,7 @@ def _kind(runs: int) -> str:
 
 def splits(results: Results) -> tuple[str, ...]:
     """Kinds of levels that the suite's agents are evaluated on."""
-    asked = {run.evaluation.get("unseen") for run in results.suite.runs}
+    asked = {run.evaluation["unseen"] for run in results.suite.runs}
     return (*SPLITS, "themes") if "themes" in asked else SPLITS
 
 

@@ -145,7 +145,7 @@ def notes(results: Results, cells: list[Cell]) -> list[str]:
 
 def _beyond(results: Results) -> list[str]:
     """What the unseen levels are, in words."""
-    asked = [run.evaluation.get("unseen", "next") for run in results.suite.runs]
+    asked = [run.evaluation["unseen"] for run in results.suite.runs]
     return list(dict.fromkeys(BEYOND[unseen] for unseen in asked))
 
 

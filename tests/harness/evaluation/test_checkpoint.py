@@ -13,7 +13,7 @@ import torch
 
 from baselines import ppo_reg, trpo_reg
 from harness.evaluation.checkpoint import read_checkpoint
-from harness.store import EvaluationError
+from harness.evaluation.settings import EvaluationError
 from tests.harness.evaluation.toy import write_checkpoint
 
 

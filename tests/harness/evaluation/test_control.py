@@ -16,7 +16,7 @@ from baselines import ppo_reg, ppo_reg_population, trpo_reg
 from harness.evaluation import control
 from harness.evaluation.checkpoint import read_checkpoint
 from harness.evaluation.control import COLUMNS, episode_seeds, evaluate, time_step
-from harness.store import EvaluationError
+from harness.evaluation.settings import EvaluationError
 from tests.harness.evaluation.toy import DEVIATION, LIMIT, MEAN, SLOPE, Toy, write_checkpoint
 
 BULLET = "harness.envs.fast_bullet:Fast{}BulletEnv-v0"

@@ -27,8 +27,8 @@ from harness.evaluation.levels import (
     load_agent,
     record,
 )
-from harness.evaluation.runs import Settings, evaluate_run
-from harness.store import EvaluationError
+from harness.evaluation.runs import evaluate_run
+from harness.evaluation.settings import EvaluationError, Settings
 
 ARGS = Args(num_levels=10, start_level=5, dropout=0.5)
 

@@ -14,8 +14,8 @@ import torch
 
 from baselines import ppo_reg, trpo_reg
 from harness.evaluation import control, levels, runs
-from harness.evaluation.runs import Settings, evaluate_run
-from harness.store import EvaluationError
+from harness.evaluation.runs import evaluate_run
+from harness.evaluation.settings import EvaluationError, Settings
 from tests.harness.evaluation.toy import write_checkpoint
 
 # --- a run of CoinRun -----------------------------------------------------------------------------
