@@ -1,0 +1,322 @@
+"""Regularize a module inside a training loop that you do not edit.
+
+The module's output passes through an identity node. In the backward pass the node adds the
+penalty's gradient to the loss's, as if the loss had been `loss + penalty`.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor, distributions, nn
+from torch.utils import _pytree as pytree
+
+from condwrap.policy import check_reusable
+
+Scale = float | Callable[[], float]
+
+
+class Result(Protocol):
+    """What a penalty returns."""
+
+    @property
+    def penalty(self) -> Tensor: ...
+
+    def metrics(self) -> dict[str, float]: ...
+
+
+class Penalty(Protocol):
+    """What can be attached: a penalty that needs no more than observations and output."""
+
+    def __call__(self, policy: Callable[[Any], Any], obs: Any, *, output: Any = None) -> Result: ...
+
+
+def attach(module: nn.Module, penalty: Penalty, *, obs: int | str = 0) -> Attached:
+    """Add a penalty's gradient to every backward pass through a module.
+
+    Where the loss can be edited, `loss + penalty(policy, obs).penalty` is clearer. Here the loop,
+    the loss and the optimizer stay as they are:
+
+    - A call of the module in training mode with gradients is penalized, once for each backward
+      pass through its output. In evaluation mode, under `no_grad` and under `inference_mode`
+      nothing happens.
+    - The gradient is that of loss + scale · penalty, for the module's parameters and for inputs
+      that require one, such as the features of a shared trunk. The loss that the loop prints does
+      not contain the penalty.
+    - The penalty is computed in the backward pass. An output that is never differentiated costs
+      nothing and draws no noise.
+    - With losses divided by k for gradient accumulation, set `handle.scale = 1 / k`. With a
+      GradScaler, set `handle.scale = scaler.get_scale`.
+    - A copy and a pickle of the module are without the penalty. An unpickled one needs condwrap.
+
+    Args:
+        module: Returns a tensor, a Distribution, or a tuple, list or dict of them. It is the
+            policy: the mean or the logits should be what counts of its output.
+        penalty: Such as a `ConditioningRegularizer`.
+        obs: Which argument of the module is the observation, by position or name. The others,
+            such as recurrent states, are not perturbed.
+
+    Returns:
+        A handle, which is a context manager too: `metrics()`, `scale`, `remove()`.
+
+    Raises:
+        TypeError: `module` is no module.
+        ValueError: The penalty needs more than observations and output.
+        RuntimeError: In the backward pass, under `create_graph=True`.
+
+    Example:
+        >>> import torch
+        >>> from condwrap import ConditioningRegularizer, attach
+        >>> policy = torch.nn.Linear(4, 2)
+        >>> handle = attach(policy, ConditioningRegularizer(coefficient=0.1))
+        >>> policy(torch.ones(8, 4)).square().mean().backward()
+        >>> handle.metrics()["attach/backwards"]
+        1.0
+    """
+    if not isinstance(module, nn.Module):
+        raise TypeError(
+            f"module must be a torch.nn.Module, got {type(module).__name__}: pass the policy's "
+            "network, or add penalty(policy, obs).penalty to the loss"
+        )
+    needs = [name for name in getattr(penalty, "needs", ()) if name != "output"]
+    if needs:
+        raise ValueError(
+            f"{type(penalty).__name__} needs {' and '.join(needs)}, which a module's call does not "
+            f"tell: add {type(penalty).__name__}(...)(policy, obs, "
+            f"{', '.join(f'{name}=...' for name in needs)}).penalty to the loss instead"
+        )
+    return Attached(module, penalty, obs)
+
+
+class Attached:
+    """The handle of an attached penalty; see `attach`."""
+
+    scale: Scale
+    """factor of the penalty's gradient, or a callable that gives it at each backward pass"""
+
+    def __init__(self, module: nn.Module, penalty: Penalty, obs: int | str) -> None:
+        self.module = module
+        self.penalty = penalty
+        self.obs = obs
+        self.scale = 1.0
+        self._measuring = False
+        self._forwards = 0
+        self._sums: dict[str, float] = {}
+        self._backwards = 0
+        self._hook = module.register_forward_hook(_Hook(self), with_kwargs=True)
+
+    def metrics(self) -> dict[str, float]:
+        """Means of the penalty's metrics over the backward passes since the last call.
+
+        `attach/forwards` counts the calls that could have been penalized, and `attach/backwards`
+        those that were.
+        """
+        found = {name: total / self._backwards for name, total in self._sums.items()}
+        found["attach/forwards"] = float(self._forwards)
+        found["attach/backwards"] = float(self._backwards)
+
+        self._sums = {}
+        self._forwards = 0
+        self._backwards = 0
+        return found
+
+    def remove(self) -> None:
+        """Leave the module as it was. Outputs from before are still penalized in backward."""
+        self._hook.remove()
+
+    def __enter__(self) -> Attached:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.remove()
+
+    @torch.compiler.disable  # type: ignore[untyped-decorator]
+    def _carry(self, args: tuple[Any, ...], kwargs: dict[str, Any], output: Any) -> Any:
+        """The output, through a node whose backward adds the penalty's gradient."""
+        if self._measuring or not (self.module.training and torch.is_grad_enabled()):
+            return None  # which leaves the output as it is
+        carried = [x for x in tensors_in(output) if x.requires_grad]
+        if not carried:
+            return None
+
+        _observation(args, kwargs, self.obs)  # an error belongs here, not in the backward pass
+        self._forwards += 1
+        call = _Call(
+            handle=self,
+            args=args,
+            kwargs=kwargs,
+            output=output,
+            carried=carried,
+            inputs=[x for x in tensors_in((args, kwargs)) if x.requires_grad],
+            parameters=[x for x in self.module.parameters() if x.requires_grad],
+        )
+        passed = _Carry.apply(call, *carried, *call.inputs, *call.parameters)  # type: ignore[no-untyped-call]
+        return replace_tensors(output, carried, passed)
+
+    def _measure(self, policy: Callable[[Any], Any], obs: Any, output: Any) -> Tensor:
+        """The scaled penalty; its metrics are kept."""
+        self._measuring = True
+        try:
+            result = self.penalty(policy, obs, output=output)
+        finally:
+            self._measuring = False
+
+        for name, value in result.metrics().items():
+            self._sums[name] = self._sums.get(name, 0.0) + value
+        self._backwards += 1
+        scale = self.scale() if callable(self.scale) else self.scale
+        return result.penalty * scale
+
+
+class _Hook:
+    """The forward hook. A copy and a pickle of it do nothing."""
+
+    def __init__(self, handle: Attached) -> None:
+        self.handle = handle
+
+    def __call__(
+        self, module: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any], output: Any
+    ) -> Any:
+        return self.handle._carry(args, kwargs, output)
+
+    def __reduce__(self) -> tuple[Callable[[], Any], tuple[()]]:
+        return _make_inert, ()
+
+
+def _make_inert() -> Callable[..., None]:
+    return _inert
+
+
+def _inert(*_: Any) -> None:
+    """A forward hook that leaves the output as it is."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Call:
+    """One call of the module, for its backward pass."""
+
+    handle: Attached
+    args: tuple[Any, ...]
+    kwargs: dict[str, Any]
+    output: Any
+    carried: list[Tensor]
+    """tensors of the output, those with a gradient"""
+    inputs: list[Tensor]
+    """tensors among the arguments, those that require a gradient"""
+    parameters: list[Tensor]
+
+    def gradients(self) -> Sequence[Tensor | None]:
+        """Of the scaled penalty: for carried, inputs and parameters."""
+        module = self.handle.module
+        carried = [x.detach().requires_grad_() for x in self.carried]
+        inputs = [x.detach().requires_grad_() for x in self.inputs]
+        args, kwargs = replace_tensors((self.args, self.kwargs), self.inputs, inputs)
+        obs = _observation(args, kwargs, self.handle.obs)
+        output = None
+        if _is_reusable(module, carried):  # then pi(S) needs no second evaluation
+            output = replace_tensors(self.output, self.carried, carried)
+
+        def policy(obs: Any) -> Any:
+            return _call(module, args, kwargs, self.handle.obs, obs)
+
+        with torch.enable_grad():
+            penalty = self.handle._measure(policy, obs, output)
+            leaves = [*carried, *inputs, *self.parameters]
+            if not penalty.requires_grad:  # a coefficient of 0
+                return [None] * len(leaves)
+            return torch.autograd.grad(penalty, leaves, allow_unused=True)
+
+
+class _Carry(torch.autograd.Function):
+    """The identity on `carried`, whose backward adds the penalty's gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, call: _Call, *tensors: Tensor) -> tuple[Tensor, ...]:
+        ctx.call = call
+        ctx.set_materialize_grads(False)
+        return tuple(x.view_as(x) for x in tensors[: len(call.carried)])
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():
+            raise RuntimeError(
+                "an attached penalty cannot be differentiated twice: create_graph=True would count "
+                "it in Hessian-vector products. Remove the handle, or put the module in eval mode, "
+                "for this call; add the penalty to the loss to differentiate it twice"
+            )
+        of_penalty = ctx.call.gradients()
+        of_loss = [*gradients, *[None] * (len(of_penalty) - len(gradients))]
+        return None, *[_add(x, y) for x, y in zip(of_loss, of_penalty, strict=True)]
+
+
+def _add(one: Tensor | None, other: Tensor | None) -> Tensor | None:
+    if one is None:
+        return other
+    return one if other is None else one + other
+
+
+def _is_reusable(module: nn.Module, output: list[Tensor]) -> bool:
+    """Whether the penalty can take the output of the loop's own call for pi(S)."""
+    try:
+        check_reusable(module)
+    except ValueError:  # dropout or batch norm in training mode
+        return False
+    return all(x.dtype in (torch.float32, torch.float64) for x in output)
+
+
+def _observation(args: tuple[Any, ...], kwargs: dict[str, Any], which: int | str) -> Any:
+    """The argument that is the observation."""
+    try:
+        return kwargs[which] if isinstance(which, str) else args[which]
+    except (KeyError, IndexError):
+        raise ValueError(
+            f"obs={which!r} names no argument of the module's call, which had {len(args)} by "
+            f"position and {', '.join(kwargs) or 'none'} by name: pass attach(..., obs=...)"
+        ) from None
+
+
+def _call(
+    module: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any], which: int | str, obs: Any
+) -> Any:
+    """The module on another observation."""
+    if isinstance(which, str):
+        return module(*args, **{**kwargs, which: obs})
+    return module(*args[:which], obs, *args[which + 1 :], **kwargs)
+
+
+# --- tensors in a structure ----------------------------------------------------------------------
+
+
+def tensors_in(structure: Any) -> list[Tensor]:
+    """Each tensor of a tuple, list, dict or Distribution, once."""
+    found: dict[int, Tensor] = {}
+    for leaf in pytree.tree_leaves(structure):
+        if isinstance(leaf, Tensor):
+            found[id(leaf)] = leaf
+        elif isinstance(leaf, distributions.Distribution):
+            found |= {id(x): x for x in tensors_in(vars(leaf))}
+    return list(found.values())
+
+
+def replace_tensors(structure: Any, old: Sequence[Tensor], new: Sequence[Tensor]) -> Any:
+    """The structure with new tensors in the place of old ones; a Distribution is copied."""
+    table = {id(x): y for x, y in zip(old, new, strict=True)}
+
+    def replace(leaf: Any) -> Any:
+        if isinstance(leaf, distributions.Distribution):
+            copied = copy.copy(leaf)
+            vars(copied).update(pytree.tree_map(replace, vars(leaf)))
+            return copied
+        return table.get(id(leaf), leaf)
+
+    return pytree.tree_map(replace, structure)
