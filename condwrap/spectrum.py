@@ -9,7 +9,7 @@ they were, and can be differentiated, so that each can serve as a penalty.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
@@ -19,6 +19,8 @@ from torch.func import jvp, vmap
 from condwrap.functional import safe_norm
 from condwrap.jacobian import jacobians, pullback, read_states, response, zero_delta
 from condwrap.policy import Policy, Select
+
+Product = Callable[[Tensor], Tensor]
 
 
 def jacobian_singular_values(
@@ -95,16 +97,18 @@ def largest_singular_value(
     select: Select = "default",
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    """Largest singular value of each state's Jacobian by power iteration, `[B]`, from below.
+    """Largest singular value of each state's Jacobian without holding it, `[B]`, from below.
 
-    v <- Jᵀ J v / ‖Jᵀ J v‖, then ‖J v‖, with v detached: where v has converged, the gradient is
-    exact. The Jacobian is never held: each iteration costs a forward-mode and a reverse-mode
-    product. The error shrinks by (sigma_2 / sigma_1)⁴ with each.
+    Lanczos bidiagonalization (Golub and Kahan, 1965) with full reorthogonalization: V spans the
+    iterates, U their images, and v is the direction that Uᵀ J V stretches most. The result is
+    ‖J v‖, with v detached: where v has converged, the gradient is exact. Each iteration costs a
+    forward-mode and a reverse-mode product, as one of power iteration does, and memory for m + n
+    numbers a state. After min(m, n) iterations, where it stops, the result is exact.
 
     Args:
         policy: As for `jacobian_singular_values`; its operations need a forward mode.
         obs: As for `jacobian_singular_values`.
-        iterations: Power iterations, at least 1.
+        iterations: At most so many, at least 1.
         select: Which tensor of the policy's output counts.
         generator: Draws the first v; by default a new one of seed 0.
 
@@ -120,14 +124,57 @@ def largest_singular_value(
     _at_least_1("iterations", iterations)
     states = read_states(obs, select)
     respond, at = response(policy, states, select), zero_delta(states)
-    v = _normalize(_noise(at.shape, at, generator))
-    with torch.no_grad():
-        _, product = pullback(policy, states, select)
-        for _ in range(iterations):
-            change = jvp(respond, (at,), (v,))[1]
-            v = _normalize(product(_normalize(change)))  # sigma⁴ would leave the range of float32
+    first = _normalize(_noise(at.shape, at, generator))
+    with torch.no_grad(), torch.autocast(states.device.type, enabled=False):
+        output, transposed_product = pullback(policy, states, select)
+        v = _stretched_most(
+            lambda v: jvp(respond, (at,), (v,))[1],
+            transposed_product,
+            first,
+            min(iterations, output.shape[-1], at.shape[-1]),
+        )
     largest: Tensor = safe_norm(jvp(respond, (at,), (v,))[1])
     return largest
+
+
+def _stretched_most(
+    product: Product, transposed_product: Product, first: Tensor, iterations: int
+) -> Tensor:
+    """The unit vector v, `[B, n]`, that Uᵀ J V stretches most; V and U hold Lanczos vectors."""
+    rights = first[:, None]  # v_1 to v_k, [B, k, n]
+    lefts = first.new_zeros(len(first), 0, 0)  # u_1 to u_k, [B, k, m]
+    diagonal: list[Tensor] = []
+    above: list[Tensor] = []  # J V = U (bidiagonal matrix)
+    for k in range(iterations):
+        # alpha u_k = J v_k - beta u_{k-1}
+        left = product(rights[:, k])
+        if k:
+            left = _orthogonal_to(lefts, left)
+        diagonal.append(safe_norm(left))
+        left = _normalize(left)[:, None]
+        lefts = torch.cat([lefts, left], 1) if k else left
+
+        # beta v_{k+1} = Jᵀ u_k - alpha v_k
+        right = _orthogonal_to(rights, transposed_product(lefts[:, k]))
+        above.append(safe_norm(right))
+        rights = torch.cat([rights, _normalize(right)[:, None]], 1)
+
+    # Uᵀ J V, upper bidiagonal, [B, k, k + 1]
+    matrix = torch.diag_embed(torch.stack(diagonal, -1))
+    matrix = torch.nn.functional.pad(matrix, (0, 1))
+    matrix = matrix + torch.diag_embed(torch.stack(above, -1), offset=1)[:, :-1]
+    values = torch.linalg.svd(matrix.nan_to_num())  # of a NaN, LAPACK makes an error
+    return _normalize(torch.einsum("bk,bkn->bn", values.Vh[:, 0], rights))
+
+
+def _orthogonal_to(basis: Tensor, x: Tensor) -> Tensor:
+    """x, `[B, n]`, without its part in the span of the basis, `[B, k, n]`, whose rows are units.
+
+    Twice is enough (Giraud et al., 2005).
+    """
+    for _ in range(2):
+        x = x - torch.einsum("bk,bkn->bn", torch.einsum("bkn,bn->bk", basis, x), basis)
+    return x
 
 
 def squared_frobenius_norm(

@@ -244,21 +244,26 @@ def test_the_mean_square_of_the_quotient_is_the_frobenius_norm_over_n(estimator)
 # --- the largest ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("iterations", [1, 2, 5])
-def test_power_iteration_is_what_the_formula_says(iterations):
-    matrices = torch.randn(6, 3, 5, dtype=torch.float64)
+@pytest.mark.parametrize("iterations", [1, 2, 3, 5])
+def test_the_direction_is_the_best_in_the_space_of_the_iterates(iterations):
+    """V spans k + 1 powers of JᵀJ times the first vector, U spans J times the first k of them."""
+    matrices = torch.randn(6, 7, 9, dtype=torch.float64)
     policy, obs = with_jacobians(matrices)
     got = largest_singular_value(policy, obs, iterations=iterations)
-    first = torch.randn(6, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    first = torch.randn(6, 9, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     gram = matrices.mT @ matrices
-    v = (torch.linalg.matrix_power(gram, iterations) @ first[..., None])[..., 0]
-    expected = torch.einsum("bmn,bn->bm", matrices, v).norm(dim=1) / v.norm(dim=1)
-    torch.testing.assert_close(got, expected, rtol=1e-12, atol=0)
+    krylov = [torch.linalg.matrix_power(gram, k) @ first[..., None] for k in range(iterations + 1)]
+    spanning = torch.cat([x / x.norm(dim=1, keepdim=True) for x in krylov], -1)
+    rights = torch.linalg.qr(spanning).Q
+    lefts = torch.linalg.qr(matrices @ spanning[..., :-1]).Q
+    best = torch.linalg.svd(lefts.mT @ matrices @ rights).Vh[:, 0]
+    expected = (matrices @ rights @ best[..., None]).norm(dim=1)[:, 0]
+    torch.testing.assert_close(got, expected, rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize(("m", "n"), SHAPES)
 @pytest.mark.parametrize(("dtype", "rtol"), [(torch.float32, 1e-6), (torch.float64, 1e-14)])
-def test_power_iteration_rises_to_the_largest_singular_value(m, n, dtype, rtol):
+def test_iterations_rise_to_the_largest_singular_value(m, n, dtype, rtol):
     matrices = of_singular_values(np.geomspace(5.0, 1.0, min(m, n)), m, n).to(dtype)
     policy, obs = with_jacobians(matrices)
     path = [largest_singular_value(policy, obs, iterations=k) for k in (1, 2, 4, 8, 30)]
@@ -270,24 +275,23 @@ def test_power_iteration_rises_to_the_largest_singular_value(m, n, dtype, rtol):
 
 
 @pytest.mark.parametrize(("m", "n"), [(8, 3), (3, 8)])
-def test_power_iteration_finds_the_largest_singular_value_of_a_network(m, n):
+def test_the_largest_singular_value_of_a_network(m, n):
     policy, obs = mlp(n, m), torch.randn(8, n)
     exact = jacobian_singular_values(policy, obs)[:, 0]
     got = largest_singular_value(policy, obs, iterations=100)
     torch.testing.assert_close(got, exact, rtol=1e-4, atol=0)
 
 
-@pytest.mark.parametrize(("ratio", "iterations"), [(0.5, 6), (0.8, 15)])
-def test_the_error_shrinks_by_the_fourth_power_of_the_ratio(ratio, iterations):
-    policy, obs = with_jacobians(of_singular_values([1.0, ratio], 4, 6))
-    before, after = (
-        1 - largest_singular_value(policy, obs, iterations=k) for k in (iterations, iterations + 1)
-    )
-    np.testing.assert_allclose(after / before, ratio**4, rtol=0.02)
+def test_twenty_iterations_suffice_for_a_policy_of_a_humanoids_size():
+    """Power iteration was 3% off after as many."""
+    net = torch.nn.Sequential(torch.nn.Linear(44, 64), torch.nn.Tanh(), torch.nn.Linear(64, 17))
+    obs = torch.randn(64, 44)
+    exact = jacobian_singular_values(net, obs)[:, 0]
+    torch.testing.assert_close(largest_singular_value(net, obs), exact, rtol=1e-5, atol=0)
 
 
 @pytest.mark.parametrize("scale", [1e-15, 1e-12, 1e12, 1e15])
-def test_power_iteration_survives_a_saturated_or_steep_policy(scale):
+def test_iterations_survive_a_saturated_or_steep_policy(scale):
     matrices = of_singular_values([3.0, 1.0], 4, 6).float()
     got = largest_singular_value(*with_jacobians(matrices * scale))
     torch.testing.assert_close(got / scale, torch.full((20,), 3.0), rtol=1e-5, atol=0)
@@ -305,8 +309,7 @@ def test_where_it_has_converged_the_gradient_is_that_of_the_exact_one(m, n):
 
 
 def test_twenty_iterations_are_the_default():
-    """Singular values of 1 and 0.99 are far from told apart, so each iteration shows."""
-    policy, obs = with_jacobians(torch.diag(torch.tensor([1.0, 0.99])).double()[None])
+    policy, obs = with_jacobians(torch.diag(torch.linspace(0.9, 1.0, 100).double())[None])
     default = largest_singular_value(policy, obs)
     assert default == largest_singular_value(policy, obs, iterations=20)
     assert default < largest_singular_value(policy, obs, iterations=21)
@@ -364,7 +367,8 @@ def test_a_jacobian_too_large_to_be_held_is_measured():
     ("measure", "options", "evaluations"),
     [
         (largest_singular_value, {"iterations": 1}, 3),
-        (largest_singular_value, {"iterations": 5}, 7),
+        (largest_singular_value, {"iterations": 2}, 4),
+        (largest_singular_value, {"iterations": 50}, 5),  # of 3 outputs no more are needed
         (squared_frobenius_norm, {"probes": 1}, 1),
         (squared_frobenius_norm, {"probes": 50}, 1),
     ],
