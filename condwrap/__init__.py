@@ -4,6 +4,7 @@ from condwrap.attach import attach
 from condwrap.functional import clamping_penalty, conditioning_quotient
 from condwrap.perturbation import gaussian, sphere, uniform
 from condwrap.regularizer import Conditioning, ConditioningRegularizer
+from condwrap.summary import summary
 
 __version__ = "0.1.0"
 
@@ -15,5 +16,6 @@ __all__ = [
     "conditioning_quotient",
     "gaussian",
     "sphere",
+    "summary",
     "uniform",
 ]

@@ -49,7 +49,7 @@ def jacobian_singular_values(
         [[3.0, 2.0]]
     """
     parts = _jacobians(policy, obs, select, chunk_size)
-    return torch.cat(list(map(_singular_values, parts)))  # a loop's name would hold a second chunk
+    return torch.cat(list(map(singular_values, parts)))  # a loop's name would hold a second chunk
 
 
 def condition_number(
@@ -227,7 +227,7 @@ def _mean_square(jacobian: Tensor) -> Tensor:
     return jacobian.square().sum((1, 2)) / min(jacobian.shape[1:])
 
 
-def _singular_values(jacobian: Tensor) -> Tensor:
+def singular_values(jacobian: Tensor) -> Tensor:
     # of a NaN, LAPACK makes zeros or an error
     finite = jacobian.isfinite().flatten(1).all(1)[:, None]
     values = _finite_singular_values(torch.where(finite[..., None], jacobian, 0.0))
