@@ -228,6 +228,12 @@ def _mean_square(jacobian: Tensor) -> Tensor:
 
 
 def singular_values(jacobian: Tensor) -> Tensor:
+    """Of Jacobians that are held, `[B, m, n]`: `[B, min(m, n)]`, largest first; NaN where it is.
+
+    Example:
+        >>> singular_values(torch.diag(torch.tensor([2.0, 3.0]))[None]).tolist()
+        [[3.0, 2.0]]
+    """
     # of a NaN, LAPACK makes zeros or an error
     finite = jacobian.isfinite().flatten(1).all(1)[:, None]
     values = _finite_singular_values(torch.where(finite[..., None], jacobian, 0.0))
