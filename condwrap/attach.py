@@ -6,17 +6,15 @@ penalty's gradient to the loss's, as if the loss had been `loss + penalty`.
 
 from __future__ import annotations
 
-import copy
-import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Protocol
 
 import torch
-from torch import Tensor, distributions, nn
-from torch.utils import _pytree as pytree
+from torch import Tensor, nn
 
-from condwrap.policy import check_reusable
+from condwrap.carry import Call, Carry, find_observation, replace_tensors, tensors_in
+from condwrap.policy import Policy
 
 Scale = float | Callable[[], float]
 
@@ -33,7 +31,7 @@ class Result(Protocol):
 class Penalty(Protocol):
     """What can be attached: a penalty that needs no more than observations and output."""
 
-    def __call__(self, policy: Callable[[Any], Any], obs: Any, *, output: Any = None) -> Result: ...
+    def __call__(self, policy: Policy, obs: Any, *, output: Any = None) -> Result: ...
 
 
 def attach(module: nn.Module, penalty: Penalty, *, obs: int | str = 0) -> Attached:
@@ -149,10 +147,12 @@ class Attached:
         if not carried:
             return None
 
-        _observation(args, kwargs, self.obs)  # an error belongs here, not in the backward pass
+        find_observation(args, kwargs, self.obs)  # an error belongs here, not in the backward pass
         self._forwards += 1
-        call = _Call(
-            handle=self,
+        call = Call(
+            module=self.module,
+            which=self.obs,
+            measure=self._measure,
             args=args,
             kwargs=kwargs,
             output=output,
@@ -160,10 +160,10 @@ class Attached:
             inputs=[x for x in tensors_in((args, kwargs)) if x.requires_grad],
             parameters=[x for x in self.module.parameters() if x.requires_grad],
         )
-        passed = _Carry.apply(call, *carried, *call.inputs, *call.parameters)  # type: ignore[no-untyped-call]
+        passed = Carry.apply(call, *carried, *call.inputs, *call.parameters)  # type: ignore[no-untyped-call]
         return replace_tensors(output, carried, passed)
 
-    def _measure(self, policy: Callable[[Any], Any], obs: Any, output: Any) -> Tensor:
+    def _measure(self, policy: Policy, obs: Any, output: Any) -> Tensor:
         """The scaled penalty; its metrics are kept."""
         self._measuring = True
         try:
@@ -199,124 +199,3 @@ def _make_inert() -> Callable[..., None]:
 
 def _inert(*_: Any) -> None:
     """A forward hook that leaves the output as it is."""
-
-
-@dataclasses.dataclass(frozen=True)
-class _Call:
-    """One call of the module, for its backward pass."""
-
-    handle: Attached
-    args: tuple[Any, ...]
-    kwargs: dict[str, Any]
-    output: Any
-    carried: list[Tensor]
-    """tensors of the output, those with a gradient"""
-    inputs: list[Tensor]
-    """tensors among the arguments, those that require a gradient"""
-    parameters: list[Tensor]
-
-    def gradients(self) -> Sequence[Tensor | None]:
-        """Of the scaled penalty: for carried, inputs and parameters."""
-        module = self.handle.module
-        carried = [x.detach().requires_grad_() for x in self.carried]
-        inputs = [x.detach().requires_grad_() for x in self.inputs]
-        args, kwargs = replace_tensors((self.args, self.kwargs), self.inputs, inputs)
-        obs = _observation(args, kwargs, self.handle.obs)
-        output = None
-        if _is_reusable(module, carried):  # then pi(S) needs no second evaluation
-            output = replace_tensors(self.output, self.carried, carried)
-
-        def policy(obs: Any) -> Any:
-            return _call(module, args, kwargs, self.handle.obs, obs)
-
-        with torch.enable_grad():
-            penalty = self.handle._measure(policy, obs, output)
-            leaves = [*carried, *inputs, *self.parameters]
-            if not penalty.requires_grad:  # a coefficient of 0
-                return [None] * len(leaves)
-            return torch.autograd.grad(penalty, leaves, allow_unused=True)
-
-
-class _Carry(torch.autograd.Function):
-    """The identity on `carried`, whose backward adds the penalty's gradient."""
-
-    @staticmethod
-    def forward(ctx: Any, call: _Call, *tensors: Tensor) -> tuple[Tensor, ...]:
-        ctx.call = call
-        ctx.set_materialize_grads(False)
-        return tuple(x.view_as(x) for x in tensors[: len(call.carried)])
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        if torch.is_grad_enabled():
-            raise RuntimeError(
-                "an attached penalty cannot be differentiated twice: create_graph=True would count "
-                "it in Hessian-vector products. Remove the handle, or put the module in eval mode, "
-                "for this call; add the penalty to the loss to differentiate it twice"
-            )
-        of_penalty = ctx.call.gradients()
-        of_loss = [*gradients, *[None] * (len(of_penalty) - len(gradients))]
-        return None, *[_add(x, y) for x, y in zip(of_loss, of_penalty, strict=True)]
-
-
-def _add(one: Tensor | None, other: Tensor | None) -> Tensor | None:
-    if one is None:
-        return other
-    return one if other is None else one + other
-
-
-def _is_reusable(module: nn.Module, output: list[Tensor]) -> bool:
-    """Whether the penalty can take the output of the loop's own call for pi(S)."""
-    try:
-        check_reusable(module)
-    except ValueError:  # dropout or batch norm in training mode
-        return False
-    return all(x.dtype in (torch.float32, torch.float64) for x in output)
-
-
-def _observation(args: tuple[Any, ...], kwargs: dict[str, Any], which: int | str) -> Any:
-    """The argument that is the observation."""
-    try:
-        return kwargs[which] if isinstance(which, str) else args[which]
-    except (KeyError, IndexError):
-        raise ValueError(
-            f"obs={which!r} names no argument of the module's call, which had {len(args)} by "
-            f"position and {', '.join(kwargs) or 'none'} by name: pass attach(..., obs=...)"
-        ) from None
-
-
-def _call(
-    module: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any], which: int | str, obs: Any
-) -> Any:
-    """The module on another observation."""
-    if isinstance(which, str):
-        return module(*args, **{**kwargs, which: obs})
-    return module(*args[:which], obs, *args[which + 1 :], **kwargs)
-
-
-# --- tensors in a structure ----------------------------------------------------------------------
-
-
-def tensors_in(structure: Any) -> list[Tensor]:
-    """Each tensor of a tuple, list, dict or Distribution, once."""
-    found: dict[int, Tensor] = {}
-    for leaf in pytree.tree_leaves(structure):
-        if isinstance(leaf, Tensor):
-            found[id(leaf)] = leaf
-        elif isinstance(leaf, distributions.Distribution):
-            found |= {id(x): x for x in tensors_in(vars(leaf))}
-    return list(found.values())
-
-
-def replace_tensors(structure: Any, old: Sequence[Tensor], new: Sequence[Tensor]) -> Any:
-    """The structure with new tensors in the place of old ones; a Distribution is copied."""
-    table = {id(x): y for x, y in zip(old, new, strict=True)}
-
-    def replace(leaf: Any) -> Any:
-        if isinstance(leaf, distributions.Distribution):
-            copied = copy.copy(leaf)
-            vars(copied).update(pytree.tree_map(replace, vars(leaf)))
-            return copied
-        return table.get(id(leaf), leaf)
-
-    return pytree.tree_map(replace, structure)
