@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from typing import Any
 
@@ -13,14 +12,9 @@ from torch.utils import _pytree as pytree
 
 from condwrap.jacobian import read_states
 from condwrap.observation import States
-from condwrap.penalties.evaluation import (
-    check_weight,
-    evaluate,
-    find_distribution,
-    per_state,
-    read_value,
-    require,
-)
+from condwrap.penalties.checks import check_weight, read_value, require
+from condwrap.penalties.distributions import detached, find_distribution, per_state
+from condwrap.penalties.evaluation import evaluate
 from condwrap.penalties.noise import Noise
 from condwrap.penalties.protocol import Penalized, penalized
 from condwrap.penalties.random_shift import RandomShift
@@ -132,14 +126,3 @@ def values(value: Any, states: States, augmented: States, answer: Any) -> tuple[
         )
     old = read_value(value, states, "value")
     return old.detach(), read_value(beside[0], states, "V beside the distribution")
-
-
-def detached(distribution: td.Distribution) -> td.Distribution:
-    """The same distribution, its parameters without a gradient."""
-    twin = copy.copy(distribution)
-    for name, x in vars(distribution).items():
-        if isinstance(x, Tensor):
-            vars(twin)[name] = x.detach()
-        elif isinstance(x, td.Distribution):
-            vars(twin)[name] = detached(x)
-    return twin

@@ -9,15 +9,8 @@ from torch import Tensor
 
 from condwrap.functional import safe_norm
 from condwrap.jacobian import read_states, zero_delta
-from condwrap.penalties.evaluation import (
-    check_length,
-    check_weight,
-    clean_output,
-    evaluate,
-    masked_mean,
-    require,
-    successors,
-)
+from condwrap.penalties.checks import check_length, check_weight, require
+from condwrap.penalties.evaluation import clean_output, evaluate, masked_mean, successors
 from condwrap.penalties.noise import Noise
 from condwrap.penalties.protocol import Penalized, penalized
 from condwrap.policy import Policy, Select, check_select, flat_output

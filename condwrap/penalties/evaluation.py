@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch import distributions as td
 from torch.utils import _pytree as pytree
 
 from condwrap.observation import States
@@ -33,54 +31,6 @@ def clean_output(policy: Policy, states: States, output: Any, select: Select) ->
         return flat_output(evaluate(policy, states), select, states.batch)
     check_reusable(policy)
     return flat_output(output, select, states.batch, known=True)
-
-
-def find_distribution(output: Any, states: States, penalty: str) -> td.Distribution:
-    """The distribution that a policy returned, alone or beside tensors.
-
-    Raises:
-        TypeError: There is none, or there are several.
-        ValueError: It lost the batch axis.
-    """
-    found = [x for x in pytree.tree_leaves(output) if isinstance(x, td.Distribution)]
-    if len(found) != 1:
-        raise TypeError(
-            f"{penalty} needs a policy that returns one torch.distributions.Distribution, got "
-            f"{len(found)} in a {type(output).__name__}: wrap the policy, such as "
-            "lambda obs: torch.distributions.Normal(mean(obs), std)"
-        )
-    distribution: td.Distribution = found[0]
-    if distribution.batch_shape[:1] != states.batch:
-        raise ValueError(
-            f"the policy's distribution must begin with the batch axis {tuple(states.batch)} of "
-            f"the observations, got batch shape {tuple(distribution.batch_shape)}"
-        )
-    return distribution
-
-
-def per_state(x: Tensor) -> Tensor:
-    """Sum over all axes but the first, `[B, ...]` to `[B]`: of log-probabilities and of KL."""
-    return x.reshape(len(x), -1).sum(-1)
-
-
-def read_value(output: Any, states: States, source: str) -> Tensor:
-    """V of each state, `[B]`, from what a critic returned: `[B]` or `[B, 1]`.
-
-    Raises:
-        ValueError: It is something else.
-    """
-    batch = tuple(states.batch)
-    if isinstance(output, Tensor) and output.shape in (batch, (*batch, 1)):
-        return output.reshape(batch)
-    got = tuple(output.shape) if isinstance(output, Tensor) else type(output).__name__
-    raise ValueError(f"{source} must be a tensor of shape {batch} or {(*batch, 1)}, got {got}")
-
-
-def require(penalty: str, reason: str, **given: Any) -> None:
-    """Raise a ValueError that names what a penalty was not given, and why it needs it."""
-    missing = [name for name, x in given.items() if x is None]
-    if missing:
-        raise ValueError(f"{penalty} needs {' and '.join(missing)}: {reason}")
 
 
 def successors(states: States, next_obs: Any, dones: Tensor | None) -> tuple[States, Tensor]:
@@ -117,24 +67,3 @@ def masked_mean(x: Tensor, valid: Tensor) -> Tensor:
     rows = x.reshape(len(x), -1)
     total = torch.where(valid[:, None], rows, 0.0).sum()
     return total / (valid.sum() * rows.shape[1]).clamp(min=1)
-
-
-def check_weight(name: str, weight: float) -> float:
-    """Return a weight, or raise a ValueError unless it is finite and at least 0."""
-    if not (weight >= 0 and math.isfinite(weight)):
-        raise ValueError(f"{name} must be finite and at least 0, got {weight}")
-    return weight
-
-
-def check_length(name: str, length: float) -> float:
-    """Return a length, or raise a ValueError unless it is finite and above 0."""
-    if not (length > 0 and math.isfinite(length)):
-        raise ValueError(f"{name} must be finite and above 0, got {length}")
-    return length
-
-
-def check_count(name: str, count: int) -> int:
-    """Return a count, or raise a ValueError unless it is at least 1."""
-    if count < 1:
-        raise ValueError(f"{name} must be at least 1, got {count}")
-    return count

@@ -11,7 +11,7 @@ from torch.func import vmap
 from condwrap.functional import safe_norm
 from condwrap.jacobian import jacobians, pullback, read_states
 from condwrap.observation import States
-from condwrap.penalties.evaluation import check_count, check_weight
+from condwrap.penalties.checks import check_count, check_weight
 from condwrap.penalties.noise import Noise
 from condwrap.penalties.protocol import Penalized, penalized
 from condwrap.policy import Policy, Select, check_select

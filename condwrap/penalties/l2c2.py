@@ -9,15 +9,8 @@ from torch import Tensor
 
 from condwrap.jacobian import read_states
 from condwrap.observation import States
-from condwrap.penalties.evaluation import (
-    check_weight,
-    clean_output,
-    evaluate,
-    masked_mean,
-    read_value,
-    require,
-    successors,
-)
+from condwrap.penalties.checks import check_weight, read_value, require
+from condwrap.penalties.evaluation import clean_output, evaluate, masked_mean, successors
 from condwrap.penalties.noise import Noise
 from condwrap.penalties.protocol import Penalized, penalized
 from condwrap.policy import Policy, Select, check_select, flat_output
@@ -30,11 +23,11 @@ class L2C2(Noise):
     divisor is a constant for the gradient, and pairs that end an episode do not count.
 
     After Kobayashi, "L2C2: Locally Lipschitz Continuous Constraint towards Stable and Smooth
-    Reinforcement Learning" (2022, arXiv 2202.07152), which differs. It compares distributions, not
-    means; it weighs each pair by λ_up ε / (d(s̃, s) + ε), with ε = λ_low / (λ_up - λ_low); and u
-    is in [-1, 1]. Public ports are simpler. HoST's takes u in [-1, 1] and (μ(s̃) - μ(s))² alone,
-    times λ_up ε, a tenth of it for V; WBC-AGILE's takes u in [0, 1] and no ratio, weights 1 and
-    0.1; ProtoMotions' takes this ratio, between noisy and clean observations, weight 0.1 or 1.
+    Reinforcement Learning" (2022, arXiv 2202.07152), in the form of public code. The paper takes
+    Hellinger distances of the distributions and bounds the weight of each pair from both sides.
+    Of the ports, ProtoMotions' has this ratio, between noisy and clean observations, times 0.1 or
+    1. WBC-AGILE's has the numerator alone, u in [0, 1], times 1, and 0.1 for V. HoST's has it with
+    u in [-1, 1], times λ_up λ_low / (λ_up - λ_low), λ = 0.1 and 1, and a tenth of that for V.
 
     Args:
         coefficient: Weight of the policy's term, at least 0; 0 leaves the term out.

@@ -9,13 +9,9 @@ from torch import Tensor
 from torch import distributions as td
 
 from condwrap.jacobian import read_states, zero_delta
-from condwrap.penalties.evaluation import (
-    check_weight,
-    evaluate,
-    find_distribution,
-    per_state,
-    require,
-)
+from condwrap.penalties.checks import check_weight, require
+from condwrap.penalties.distributions import find_distribution, per_state
+from condwrap.penalties.evaluation import evaluate
 from condwrap.penalties.protocol import Penalized, penalized
 from condwrap.policy import Policy
 
@@ -75,7 +71,8 @@ class LipschitzPolicy:
             logprob = per_state(distribution.log_prob(check_actions(actions, distribution)))
             # 0 · delta: a policy that ignores its observations has the gradient 0
             anchored = logprob.sum() + 0.0 * delta.sum()
-            (gradient,) = torch.autograd.grad(anchored, delta, create_graph=learns)  # [B, n]
+            with torch.autocast(states.device.type, enabled=False):  # backward heeds it too
+                (gradient,) = torch.autograd.grad(anchored, delta, create_graph=learns)  # [B, n]
         with torch.set_grad_enabled(learns):
             square = gradient.square().sum(-1).mean()
             return penalized({"lcp_gradient_squared": (self.coefficient, square)})

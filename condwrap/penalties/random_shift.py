@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from condwrap.penalties.evaluation import check_count
+from condwrap.penalties.checks import check_count
 from condwrap.penalties.noise import Noise
 
 

@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from condwrap.penalties.evaluation import check_count, check_weight
+from condwrap.penalties.checks import check_count, check_weight
 from condwrap.penalties.noise import Noise
 from condwrap.penalties.protocol import Penalized, penalized
 from condwrap.policy import Policy, Select, check_select

@@ -7,17 +7,12 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch import distributions as td
 
 from condwrap.jacobian import read_states, zero_delta
 from condwrap.observation import States
-from condwrap.penalties.evaluation import (
-    check_count,
-    check_length,
-    check_weight,
-    evaluate,
-    find_distribution,
-)
+from condwrap.penalties.checks import check_count, check_length, check_weight
+from condwrap.penalties.distributions import gaussian
+from condwrap.penalties.evaluation import evaluate
 from condwrap.penalties.noise import Noise
 from condwrap.penalties.protocol import Penalized, penalized
 from condwrap.policy import Policy, check_reusable
@@ -115,22 +110,10 @@ class StateAdversarial(Noise):
             moved, _ = gaussian(evaluate(policy, states, delta), states)
             divergence = ((moved - mean) / std).square().sum() / 2
             # 0 · delta: a policy that ignores its observations has the gradient 0
-            (gradient,) = torch.autograd.grad(divergence + 0.0 * delta.sum(), delta)
+            anchored = divergence + 0.0 * delta.sum()
+            with torch.autocast(states.device.type, enabled=False):  # backward heeds it too
+                (gradient,) = torch.autograd.grad(anchored, delta)
             scale = math.sqrt(2 * step * TEMPERATURE) / (k + 2)
             ascent = (gradient + scale * self.normal(shape, at)).sign()
             delta = (delta.detach() + step * ascent).clamp(-self.radius, self.radius)
         return delta
-
-
-def gaussian(output: Any, states: States) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of the Normal that a policy returned, `[B, m]` each."""
-    distribution = find_distribution(output, states, "StateAdversarial")
-    base = distribution
-    while isinstance(base, td.Independent):
-        base = base.base_dist
-    if not isinstance(base, td.Normal):
-        raise TypeError(
-            f"StateAdversarial needs a policy that returns a Normal, got {type(base).__name__}: "
-            "its formula is the divergence of two Gaussians"
-        )
-    return base.loc.reshape(len(base.loc), -1), base.scale.reshape(len(base.scale), -1)

@@ -116,6 +116,18 @@ def test_dropout_and_batch_norm_leave_no_trace(name):
         assert PENALTIES["caps"](spatial=0.0)(net, obs, **still).penalty.item() == 0.0
 
 
+@every_penalty
+def test_autocast_does_not_round_it(name):
+    policy = Gaussian(mlp(), [0.0, 0.0]).float()
+    obs, given = batch()
+    obs = obs.float()
+    given = {key: x.float() for key, x in given.items()}
+    want = make(name)(policy, obs, **given)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        got = make(name)(policy, obs, **given)
+    assert got.penalty == want.penalty
+
+
 @pytest.mark.parametrize("name", [name for name in PENALTIES if name != "lcp"])
 def test_a_policy_without_a_gradient_is_refused(name):
     policy = Gaussian(mlp(), [0.0, 0.0]).requires_grad_(False)
