@@ -23,7 +23,7 @@ class CAPS(Noise):
     Reinforcement Learning" (2021, arXiv 2012.06644): Conditioning for Action Policy Smoothness,
     with Euclidean distances. Public ports often square them, and pair a state with the row below
     it in a shuffled batch; here s' comes from `next_obs`, and where `dones` is set the pair does
-    not count. The gradient of a distance is 0 where it is 0.
+    not count. The gradient of a distance is 0 where it is 0. The weights depend on the task.
 
     Args:
         temporal: λ_T, at least 0; 0 leaves the term out.

@@ -96,8 +96,8 @@ class L2C2(Noise):
         following, valid = successors(states, next_obs, dones)
         step = difference(states, following)  # [B, n]
         u = self.u_min + (1 - self.u_min) * self.uniform((len(step), 1), step)
-        delta = (u * step).detach()
-        distance = masked_mean(delta.square(), valid)
+        delta = u * step
+        distance = masked_mean(delta.detach().square(), valid)
         divisor = torch.where(distance > 0, distance, 1.0)  # nothing moved: the ratio is 0
 
         terms = {}

@@ -95,6 +95,22 @@ def test_the_clean_side_has_no_gradient():
             torch.testing.assert_close(x, y)
 
 
+def test_a_known_output_is_a_target_too():
+    gaussian, shared = Gaussian(mlp(), [0.1, -0.3]), Shared()
+    cases = [(gaussian, {"value_term": False}), (shared, {})]
+    for policy, options in cases:
+        gradients = []
+        for track in (True, False):
+            with torch.set_grad_enabled(track):
+                output = policy(OBS)
+            value = output[1] if policy is shared else None
+            penalty = AugmentationConsistency(1.0, reverse, **options)
+            result = penalty(policy, OBS, output=output, value=value)
+            gradients.append(torch.autograd.grad(result.penalty, list(policy.parameters())))
+        for x, y in zip(*gradients, strict=True):
+            torch.testing.assert_close(x, y, rtol=0, atol=0)
+
+
 def test_values_come_from_a_critic_or_from_beside_the_distribution():
     shared = Shared()
     value = shared(OBS)[1]

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from torch import nn
 
 from condwrap.penalties import CAPS
 from tests.condwrap.penalties.helpers import gradcheck, linear, mlp
@@ -42,6 +43,13 @@ def test_what_follows_an_end_reaches_neither_value_nor_gradient():
         assert one is other is None or torch.equal(one, other)
 
 
+def test_an_end_does_not_count_whatever_is_known_of_it():
+    policy = linear(POLICY)
+    output = policy(OBS) + torch.tensor([[0.0], [0.0], [100.0]])
+    result = call(CAPS(spatial=0.0), policy, output=output)
+    assert result.metrics() == {"penalty/caps_temporal": 2.5}
+
+
 def test_a_batch_of_ends_alone_costs_nothing():
     result = call(CAPS(spatial=0.0), mlp(2), dones=torch.ones(3))
     assert result.penalty.item() == 0.0
@@ -77,6 +85,9 @@ def test_a_known_output_gives_the_same():
     net = mlp(2)
     known = call(CAPS(), net, output=net(OBS)).penalty
     assert torch.equal(known, call(CAPS(), net).penalty)
+    noisy = nn.Sequential(net, nn.Dropout(0.5))
+    with pytest.raises(ValueError, match="output cannot be used with Dropout"):
+        call(CAPS(), noisy, output=noisy(OBS))
 
 
 def test_it_names_what_it_lacks():

@@ -95,13 +95,26 @@ def test_the_gradient_is_that_of_finite_differences():
     assert gradcheck(mlp(2, 1), both)
 
 
+def test_the_divisor_is_a_constant_for_the_gradient():
+    # where observations are learned: 9 u² (s' - s)² / u² (s' - s)², the divisor held, has the
+    # slope -18 / (s' - s) in s
+    obs = torch.zeros(1, 1, dtype=F64, requires_grad=True)
+    next_obs = torch.full((1, 1), 2.0, dtype=F64)
+    result = L2C2()(linear([[3.0]]), obs, next_obs=next_obs, dones=torch.zeros(1))
+    (gradient,) = torch.autograd.grad(result.penalty, obs)
+    assert gradient.item() == pytest.approx(-9.0)
+
+
 def test_images_are_measured_in_units_of_255():
     images = torch.zeros(2, 1, 2, 2, dtype=torch.uint8)
     brighter = images + 255
+    seen = []
     policy = nn.Sequential(nn.Flatten(), nn.Linear(4, 4, bias=False))
+    policy[0].register_forward_pre_hook(lambda module, args: seen.append(*args))
     policy[1].weight.data = torch.eye(4) * (2 / 255)
     result = L2C2()(policy, images, next_obs=brighter, dones=torch.zeros(2))
     assert result.metrics()["penalty/l2c2_policy"] == pytest.approx(4.0)
+    assert 1 < seen[1].max() <= 255  # between the two images
 
 
 def test_a_known_output_gives_the_same():

@@ -8,7 +8,18 @@ from torch import distributions as td
 from torch import nn
 
 from condwrap import ConditioningRegularizer, penalties
-from condwrap.penalties import PENALTIES, AugmentationConsistency, ConditioningPenalty, Penalty
+from condwrap.penalties import (
+    PENALTIES,
+    AugmentationConsistency,
+    ConditioningPenalty,
+    Penalty,
+    augmentation,
+    jacobian_norm,
+    lipschitz_policy,
+    spectral,
+    state_adversarial,
+)
+from condwrap.penalties.protocol import penalized
 from tests.condwrap.penalties.helpers import Gaussian, mlp
 
 F64 = torch.float64
@@ -71,6 +82,32 @@ def test_a_weight_of_zero_adds_nothing(name):
     assert result.penalty.item() == 0.0
     assert not result.penalty.requires_grad
     assert bool(result.metrics()) == (name not in ("caps", "l2c2"))
+
+
+def test_a_weight_of_zero_does_not_multiply():
+    result = penalized({"a": (0.0, torch.tensor(torch.inf)), "b": (0.0, torch.ones(()))})
+    assert result.penalty.item() == 0.0
+    assert result.metrics("x/") == {"x/a": torch.inf, "x/b": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("name", "module"),
+    [
+        ("jacobian", jacobian_norm),
+        ("lcp", lipschitz_policy),
+        ("sa", state_adversarial),
+        ("spectral", spectral),
+        ("drac", augmentation),
+    ],
+)
+def test_a_weight_of_zero_builds_no_graph(name, module, monkeypatch):
+    def spy(weighted):
+        assert not any(term.requires_grad for _, term in weighted.values())
+        return penalized(weighted)
+
+    monkeypatch.setattr(module, "penalized", spy)
+    obs, given = batch()
+    make(name, coefficient=0.0)(Gaussian(mlp(), [0.0, 0.0]), obs, **given)
 
 
 @pytest.mark.parametrize("name", [name for name in PENALTIES if name != "lcp"])

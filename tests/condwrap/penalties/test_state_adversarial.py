@@ -83,6 +83,15 @@ def test_a_constant_policy_costs_nothing():
     assert StateAdversarial()(flat, obs()).penalty.item() == 0.0
 
 
+def test_autocast_does_not_round_the_search():
+    # the slope is 1001 - 1000, and in bf16 both weights are 1000
+    mean = nn.Sequential(linear([[1001.0], [1000.0]]), linear([[1.0, -1.0]])).float()
+    policy = Gaussian(mean, [0.0]).float()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        result = StateAdversarial(radius=0.1)(policy, torch.zeros(50, 1))
+    assert result.metrics()["penalty/sa_divergence"] == pytest.approx(0.1**2 / 2, rel=1e-2)
+
+
 def test_the_search_leaves_no_gradient_behind():
     policy = Gaussian(mlp(), [0.0, 0.0])
     with torch.no_grad():
