@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 from torch import Tensor
 from torch import distributions as td
 from torch.utils import _pytree as pytree
 
+from condwrap.attach import replace_tensors, tensors_in
 from condwrap.observation import States
 
 
@@ -56,10 +56,6 @@ def per_state(x: Tensor) -> Tensor:
 
 def detached(distribution: td.Distribution) -> td.Distribution:
     """The same distribution, its parameters without a gradient."""
-    twin = copy.copy(distribution)
-    for name, x in vars(distribution).items():
-        if isinstance(x, Tensor):
-            vars(twin)[name] = x.detach()
-        elif isinstance(x, td.Distribution):
-            vars(twin)[name] = detached(x)
+    tensors = tensors_in(distribution)
+    twin: td.Distribution = replace_tensors(distribution, tensors, [x.detach() for x in tensors])
     return twin

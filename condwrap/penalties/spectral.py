@@ -39,8 +39,8 @@ class SpectralPenalty(Noise):
         coefficient: At least 0. With 0 it is measured and nothing reaches the loss.
         function: Differentiable, `[B, r]`, largest first, to `[B]`.
         values: "all", exactly, by m vector-Jacobian products and a decomposition, r = min(m, n);
-            or "largest", r = 1, by power iteration, for images and wide outputs.
-        iterations: Of the power iteration, at least 1.
+            or "largest", r = 1, by Lanczos iterations, for images and wide outputs.
+        iterations: Of these, at least 1.
         select: Which tensor of the policy's output counts, as for `ConditioningRegularizer`.
         seed: Of the penalty's own generator, on the CPU; "largest" alone draws from it.
         generator: A generator to use instead.

@@ -7,7 +7,7 @@ import torch
 from torch import distributions as td
 from torch import nn
 
-from condwrap import ConditioningRegularizer, penalties
+from condwrap import ConditioningRegularizer, attach, penalties
 from condwrap.penalties import (
     PENALTIES,
     AugmentationConsistency,
@@ -247,3 +247,22 @@ def test_every_public_name_has_an_example():
     members = [getattr(penalties, name) for name in penalties.__all__ if name != "PENALTIES"]
     assert all(">>>" in inspect.getdoc(member) for member in members)
     assert AugmentationConsistency in PENALTIES.values()
+
+
+@pytest.mark.parametrize("name", ["jacobian", "sa", "spectral", "conditioning"])
+def test_what_needs_no_more_can_be_attached(name):
+    policy, (obs, _) = Gaussian(mlp(), [0.0, 0.0]), batch()
+    loss = policy(obs).mean.square().mean() + make(name)(policy, obs).penalty
+    want = torch.autograd.grad(loss, list(policy.parameters()), allow_unused=True)
+
+    with attach(policy, make(name)) as handle:
+        policy(obs).mean.square().mean().backward()
+    assert handle.metrics()["attach/backwards"] == 1.0
+    for parameter, gradient in zip(policy.parameters(), want, strict=True):
+        got = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
+        torch.testing.assert_close(got, torch.zeros_like(got) if gradient is None else gradient)
+
+
+def test_what_needs_more_is_not_attached():
+    with pytest.raises(ValueError, match="CAPS needs next_obs and dones, which a module's call"):
+        attach(mlp(), PENALTIES["caps"]())
