@@ -8,7 +8,7 @@ from torch import Tensor
 from torch import distributions as td
 from torch.utils import _pytree as pytree
 
-from condwrap.attach import replace_tensors, tensors_in
+from condwrap.carry import replace_tensors, tensors_in
 from condwrap.observation import States
 
 
