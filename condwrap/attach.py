@@ -14,27 +14,19 @@ import torch
 from torch import Tensor, nn
 
 from condwrap.carry import Call, Carry, find_observation, replace_tensors, tensors_in
+from condwrap.penalties.protocol import Result
 from condwrap.policy import Policy
 
 Scale = float | Callable[[], float]
 
 
-class Result(Protocol):
-    """What a penalty returns."""
-
-    @property
-    def penalty(self) -> Tensor: ...
-
-    def metrics(self) -> dict[str, float]: ...
-
-
-class Penalty(Protocol):
-    """What can be attached: a penalty that needs no more than observations and output."""
+class Attachable(Protocol):
+    """A penalty that needs no more than observations and output."""
 
     def __call__(self, policy: Policy, obs: Any, *, output: Any = None) -> Result: ...
 
 
-def attach(module: nn.Module, penalty: Penalty, *, obs: int | str = 0) -> Attached:
+def attach(module: nn.Module, penalty: Attachable, *, obs: int | str = 0) -> Attached:
     """Add a penalty's gradient to every backward pass through a module.
 
     Where the loss can be edited, `loss + penalty(policy, obs).penalty` is clearer. Here the loop,
@@ -97,7 +89,7 @@ class Attached:
     scale: Scale
     """factor of the penalty's gradient, or a callable that gives it at each backward pass"""
 
-    def __init__(self, module: nn.Module, penalty: Penalty, obs: int | str) -> None:
+    def __init__(self, module: nn.Module, penalty: Attachable, obs: int | str) -> None:
         self.module = module
         self.penalty = penalty
         self.obs = obs

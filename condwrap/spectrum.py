@@ -108,7 +108,7 @@ def largest_singular_value(
     Args:
         policy: As for `jacobian_singular_values`; its operations need a forward mode.
         obs: As for `jacobian_singular_values`.
-        iterations: At most so many, at least 1.
+        iterations: The largest number of them, at least 1.
         select: Which tensor of the policy's output counts.
         generator: Draws the first v; by default a new one of seed 0.
 

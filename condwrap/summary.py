@@ -156,7 +156,7 @@ def summary(
         regularizer: Its range, radius and selection are used; by default the paper's.
         loss: A scalar that depends on the policy's parameters, for a coefficient.
         share: Of the loss's gradient that the penalty's should be, above 0.
-        max_states: At most so many states are measured, evenly spaced in the batch.
+        max_states: How many states are measured at most, evenly spaced in the batch.
 
     Raises:
         TypeError, ValueError: As for `ConditioningRegularizer`, or a share or max_states that is
@@ -246,7 +246,7 @@ def _short(value: float) -> str:
 
 
 def _join(names: Iterable[str]) -> str:
-    """At most so many names, and how many more there are."""
+    """The first names, and how many more there are."""
     found = list(names)
     more = f" and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
     return ", ".join(found[:SHOWN]) + more
