@@ -63,10 +63,11 @@ def mad(
     """Maximal action difference (Zhang et al., 2020, arXiv 2003.08938): pi changes the most.
 
     delta maximizes ½ Σ ((mu(s + delta) - mu(s)) / sigma)² of a Gaussian policy, the KL divergence
-    of a categorical one, and ‖pi(s + delta) - pi(s)‖² of a tensor. What is found is a local
-    maximum. Of random linear policies with 12 inputs and 6 outputs, the corner of the l∞ ball that
-    changes the output most was missed by 1 start in 78%, by 5 in 35%, by 20 in 3 to 7% and by 64 in
-    less than 1%. The gradient at delta = 0 is 0, so every start is a random one.
+    of a categorical one, and ‖pi(s + delta) - pi(s)‖² of a tensor. The gradient at delta = 0 is 0,
+    so every start is a random one. What is found is a local maximum: of 1,000 random linear
+    policies with 12 inputs and 6 outputs, one start missed the best corner of the l∞ ball in 75%,
+    5 missed it in 36%, 20 in 6% and 64 in 0.4%. With 20 starts the mean loss was 0.1% of the
+    maximum, and the largest 7%.
 
     Args:
         policy: Any callable obs -> tensor, distribution, or a tuple or dict that holds one. It is
