@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
-from torch import nn
+from torch import Tensor, nn
 
 from harness.evaluation.checkpoint import Checkpoint
 from harness.evaluation.settings import EvaluationError
@@ -35,15 +35,7 @@ def evaluate(checkpoint: Checkpoint, episodes: int) -> Iterator[pd.DataFrame]:
     measures of smoothness are of the clipped ones.
     """
     module, args = checkpoint.module, checkpoint.args
-    try:
-        learner = module.Learner(args)
-        learner.load_state_dict(checkpoint.learner)
-    except (gym.error.Error, ModuleNotFoundError, module.RunError) as error:
-        raise EvaluationError(f"{checkpoint.path}: {error}") from error
-    except (KeyError, RuntimeError, ValueError) as error:  # weights of another shape or version
-        what = f"weights that today's {checkpoint.baseline} does not take"
-        raise EvaluationError(f"{checkpoint.path} holds {what}: {error!r}") from error
-
+    learner = load_learner(checkpoint)
     for policy in POLICIES:
         for episode in range(episodes):
             env_seed, noise_seed = episode_seeds(args, episode)
@@ -57,6 +49,24 @@ def evaluate(checkpoint: Checkpoint, episodes: int) -> Iterator[pd.DataFrame]:
                 env.close()
             row = {"policy": policy, "episode": episode, **found}
             yield pd.DataFrame([row], columns=COLUMNS)
+
+
+def load_learner(checkpoint: Checkpoint) -> Any:
+    """The baseline's Learner as its run left it: actor, critic and the statistics of observations.
+
+    Raises:
+        EvaluationError: Its task is not installed here, or its weights are of another version.
+    """
+    module = checkpoint.module
+    try:
+        learner = module.Learner(checkpoint.args)
+        learner.load_state_dict(checkpoint.learner)
+    except (gym.error.Error, ModuleNotFoundError, module.RunError) as error:
+        raise EvaluationError(f"{checkpoint.path}: {error}") from error
+    except (KeyError, RuntimeError, ValueError) as error:  # weights of another shape or version
+        what = f"weights that today's {checkpoint.baseline} does not take"
+        raise EvaluationError(f"{checkpoint.path} holds {what}: {error!r}") from error
+    return learner
 
 
 def episode_seeds(args: Any, episode: int) -> list[int]:
@@ -75,39 +85,54 @@ def make_env(module: Any, args: Any, stats: dict[str, Any]) -> VectorEnv:
     return env
 
 
+class Episode:
+    """An episode under way: what the policy sees next, and what was done and earned so far."""
+
+    def __init__(self, env: VectorEnv, seed: int) -> None:
+        self.env = env
+        self.obs: np.ndarray = env.reset(seed=seed)[0]
+        """normalized, `[1, n]`"""
+        self.rewards: list[float] = []
+        self.actions: list[np.ndarray] = []
+        self.over = False
+
+    def step(self, action: Tensor) -> None:
+        """Execute an action, `[1, m]`, clipped to its box."""
+        space = self.env.single_action_space
+        executed = action.numpy().reshape(1, *space.shape).clip(space.low, space.high)
+        if not np.isfinite(executed).all():
+            raise EvaluationError("its policy gives actions that are not finite: train it anew")
+
+        self.obs, reward, terminated, truncated, _ = self.env.step(executed)
+        self.rewards.append(float(reward[0]))
+        self.actions.append(executed.ravel())
+        self.over = bool(terminated[0] or truncated[0])
+
+    def measures(self) -> dict[str, float]:
+        """What a row of the evaluation tells of it."""
+        taken = np.array(self.actions)
+        rate = 1 / time_step(self.env.unwrapped.envs[0])
+        return {
+            "return": sum(self.rewards),
+            "length": len(self.rewards),
+            "action_change": action_change(taken),
+            "smoothness": smoothness(taken, rate),
+        }
+
+
 @torch.no_grad()
 def play(
     actor: nn.Module, env: VectorEnv, seed: int, noise: torch.Generator | None
 ) -> dict[str, float]:
     """One episode, with the policy's mean or, given a generator, with sampled actions."""
-    space = env.single_action_space
-    obs, _ = env.reset(seed=seed)
-    rewards: list[float] = []
-    actions: list[np.ndarray] = []
-    over = False
-
-    while not over:
-        policy = actor(torch.as_tensor(obs, dtype=torch.float32))
+    episode = Episode(env, seed)
+    while not episode.over:
+        policy = actor(torch.as_tensor(episode.obs, dtype=torch.float32))
         action = policy.mean
         if noise is not None:
             action = action + policy.stddev * torch.randn(action.shape, generator=noise)
-        executed = action.numpy().reshape(1, *space.shape).clip(space.low, space.high)
-        if not np.isfinite(executed).all():
-            raise EvaluationError("its policy gives actions that are not finite: train it anew")
-
-        obs, reward, terminated, truncated, _ = env.step(executed)
-        rewards.append(float(reward[0]))
-        actions.append(executed.ravel())
-        over = bool(terminated[0] or truncated[0])
-
-    taken = np.array(actions)
-    rate = 1 / time_step(env.unwrapped.envs[0])
-    return {
-        "return": sum(rewards),
-        "length": len(rewards),
-        "action_change": action_change(taken),
-        "smoothness": smoothness(taken, rate),
-    }
+        episode.step(action)
+    return episode.measures()
 
 
 def time_step(env: gym.Env) -> float:
