@@ -95,6 +95,8 @@ class Episode:
         self.rewards: list[float] = []
         self.actions: list[np.ndarray] = []
         self.over = False
+        self.terminated = False
+        """over for good, not by a time limit"""
 
     def step(self, action: Tensor) -> None:
         """Execute an action, `[1, m]`, clipped to its box."""
@@ -106,6 +108,7 @@ class Episode:
         self.obs, reward, terminated, truncated, _ = self.env.step(executed)
         self.rewards.append(float(reward[0]))
         self.actions.append(executed.ravel())
+        self.terminated = bool(terminated[0])
         self.over = bool(terminated[0] or truncated[0])
 
     def measures(self) -> dict[str, float]:

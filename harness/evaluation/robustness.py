@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -26,9 +26,12 @@ from condwrap import attacks
 from condwrap.attacks.ball import Norm
 from harness.evaluation.checkpoint import Checkpoint, read_checkpoint
 from harness.evaluation.control import Episode, episode_seeds, load_learner, make_env
-from harness.store import EvaluationError, read_json, write_json
+from harness.evaluation.runs import Show, ask
+from harness.evaluation.sarsa import learn_action_value
+from harness.evaluation.settings import CONTROL, EvaluationError, Settings
+from harness.files import read_json, write_json
 
-ATTACKS = ("random", "mad", "critic")
+ATTACKS = ("random", "mad", "critic", "sarsa")
 RADII = (0.0, 0.05, 0.1)
 COLUMNS = [
     "attack", "radius", "norm", "episode", "return", "length", "action_change", "smoothness"
@@ -37,21 +40,18 @@ SLOTS = 20  # episodes side by side
 STREAM = 0x61747461  # "atta"; the attack's noise is not that of any other use
 
 Attack = Callable[..., Tensor]  # obs [B, n], radius, norm, generator= -> delta [B, n]
-Show = Callable[[Iterable[pd.DataFrame], int], Iterable[pd.DataFrame]]
 
 
 @dataclasses.dataclass(frozen=True)
 class Threat:
     """The attacks that an agent is to withstand."""
 
-    attacks: tuple[str, ...] = ATTACKS
+    attacks: tuple[str, ...]
     """names of attacks"""
     radii: tuple[float, ...] = RADII
     """lengths of the longest perturbations, in deviations of the observations; 0 is no attack"""
     norm: Norm = "linf"
     """what length is: of the largest change of a number, or Euclidean"""
-    episodes: int = 20
-    """of each attack and radius"""
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.attacks if name not in ATTACKS]
@@ -66,11 +66,9 @@ class Threat:
                 raise EvaluationError(f"{name} names one twice: {values}")
         if self.norm not in get_args(Norm):
             raise EvaluationError(f"norm must be one of {get_args(Norm)}, got {self.norm!r}")
-        if self.episodes < 1:
-            raise EvaluationError(f"episodes must be at least 1, got {self.episodes}")
 
     @classmethod
-    def parse(cls, attack: str, radius: str, norm: Norm, episodes: int) -> Threat:
+    def parse(cls, attack: str, radius: str, norm: Norm) -> Threat:
         """From flags such as `--attack random,mad --radius 0,0.05,0.1`."""
         try:
             radii = tuple(float(word) for word in radius.split(","))
@@ -79,11 +77,11 @@ class Threat:
                 f"radius must be numbers with commas between them, got {radius!r}"
             ) from None
         names = tuple(word.strip() for word in attack.split(","))
-        return cls(names, radii, norm, episodes)
+        return cls(names, radii, norm)
 
 
 def evaluate_robustness(
-    path: Path, threat: Threat, show: Show = lambda parts, total: parts
+    path: Path, settings: Settings, threat: Threat, show: Show = lambda parts, total: parts
 ) -> pd.DataFrame:
     """Attack a run's final policy, once: a row for each episode, kept as robustness.csv.
 
@@ -91,7 +89,8 @@ def evaluate_robustness(
 
     Args:
         path: The run's folder.
-        threat: What is asked.
+        settings: How many episodes of each attack and radius.
+        threat: The attacks.
         show: Passes parts of the work on, and may show how many of the total are done.
 
     Raises:
@@ -102,17 +101,19 @@ def evaluate_robustness(
         raise EvaluationError(
             f"{path} is a run of {checkpoint.baseline}: attacks are for control tasks"
         )
-    asked = {
-        name: list(value) if isinstance(value, tuple) else value
-        for name, value in dataclasses.asdict(threat).items()
+    about = {
+        **ask(checkpoint, settings, CONTROL),
+        "attacks": list(threat.attacks),
+        "radii": list(threat.radii),
+        "norm": threat.norm,
+        "checkpoint_sha256": checkpoint.sha256,
     }
-    about = {**asked, "checkpoint_sha256": checkpoint.sha256}
     if read_json(path / "robustness.json") == about and (path / "robustness.csv").exists():
         return pd.read_csv(path / "robustness.csv")
 
-    parts = evaluate(checkpoint, threat)
+    parts = evaluate(checkpoint, threat, settings.episodes)
     played = sum(len(threat.attacks) if radius else 1 for radius in threat.radii)
-    total = played * len(_groups(threat.episodes))
+    total = played * len(_groups(settings.episodes))
     found = pd.concat(show(parts, total), ignore_index=True)
     found = found.sort_values(["attack", "radius", "episode"], key=_in_order(threat))
     keep(path, found, about)
@@ -127,16 +128,17 @@ def keep(path: Path, episodes: pd.DataFrame, about: dict[str, Any]) -> None:
     write_json(path / "robustness.json", about)
 
 
-def evaluate(checkpoint: Checkpoint, threat: Threat) -> Iterator[pd.DataFrame]:
+def evaluate(checkpoint: Checkpoint, threat: Threat, episodes: int) -> Iterator[pd.DataFrame]:
     """The episodes of each radius and attack, some at a time.
 
     Without a perturbation all attacks are one: they are played once, and each has their rows.
     """
     learner = load_learner(checkpoint)
+    makers = {name: make_attack(name, checkpoint, learner) for name in threat.attacks}
     for radius in threat.radii:
         for name in threat.attacks if radius else threat.attacks[:1]:
-            attack = functools.partial(make_attack(name, learner), radius=radius, norm=threat.norm)
-            for numbers in _groups(threat.episodes):
+            attack = functools.partial(makers[name], radius=radius, norm=threat.norm)
+            for numbers in _groups(episodes):
                 found = play_together(checkpoint, learner, attack, numbers)
                 names = [name] if radius else threat.attacks
                 rows = [
@@ -147,8 +149,11 @@ def evaluate(checkpoint: Checkpoint, threat: Threat) -> Iterator[pd.DataFrame]:
                 yield pd.DataFrame(rows, columns=COLUMNS)
 
 
-def make_attack(name: str, learner: Any) -> Attack:
+def make_attack(name: str, checkpoint: Checkpoint, learner: Any) -> Attack:
     """The attack on this agent, a map from the observations that it would see."""
+    if name == "sarsa":
+        q = learn_action_value(checkpoint, learner)
+        return functools.partial(attacks.robust_sarsa, learner.actor, action_value=q)
     if name == "critic":
         return functools.partial(attacks.critic, learner.critic)
     return functools.partial(getattr(attacks, name), learner.actor)

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from baselines import ppo_reg, trpo_reg
-from harness.evaluation import robustness
+from harness.evaluation import robustness, sarsa
 from harness.evaluation.checkpoint import read_checkpoint
 from harness.evaluation.control import episode_seeds
 from harness.evaluation.robustness import (
@@ -19,8 +19,8 @@ from harness.evaluation.robustness import (
     Threat,
     evaluate_robustness,
 )
-from harness.evaluation.runs import Settings, evaluate_run
-from harness.store import EvaluationError
+from harness.evaluation.runs import evaluate_run
+from harness.evaluation.settings import EvaluationError, Settings
 from tests.harness.evaluation.toy import DEVIATION, LIMIT, MEAN, SLOPE, Toy, write_checkpoint
 
 REACHER = "harness.envs.fast_bullet:FastReacherBulletEnv-v0"
@@ -47,6 +47,11 @@ def reacher(tmp_path_factory):
     return path
 
 
+def attack(path, names, radii, norm="linf", episodes=2, **options):
+    threat = Threat(tuple(names.split(",")), radii, norm)
+    return evaluate_robustness(path, Settings(episodes=episodes), threat, **options)
+
+
 def rows(found, **chosen):
     for name, value in chosen.items():
         found = found[found[name] == value]
@@ -60,7 +65,7 @@ def rows(found, **chosen):
 def test_the_strongest_change_of_one_number_by_hand(tmp_path, made, module):
     """The policy is linear in one number: mad moves each action by SLOPE · radius, up or down."""
     write_checkpoint(tmp_path, module)
-    found = evaluate_robustness(tmp_path, Threat(("mad",), (0.1,), "linf", 3))
+    found = attack(tmp_path, "mad", (0.1,), "linf", 3)
     assert list(found.columns) == COLUMNS
     assert found["episode"].tolist() == [0, 1, 2]
     assert found["length"].tolist() == [4] * 3
@@ -83,7 +88,7 @@ def test_the_critic_is_descended_by_hand(tmp_path, made):
     critic["0.bias"].fill_(20.0)
     critic["2.weight"].fill_(1.0)
     torch.save(saved, tmp_path / "checkpoint.pt")
-    evaluate_robustness(tmp_path, Threat(("critic",), (0.2,), "l2", 2))
+    attack(tmp_path, "critic", (0.2,), "l2", 2)
     for toy in made[-2:]:
         shown = [SLOPE * ((x - MEAN) / DEVIATION + 0.2) for x in toy.seen[:4]]
         np.testing.assert_allclose(toy.actions, np.clip(shown, -LIMIT, LIMIT), atol=1e-5)
@@ -91,32 +96,30 @@ def test_the_critic_is_descended_by_hand(tmp_path, made):
 
 def test_radius_0_is_the_evaluation_number_for_number(reacher):
     clean = rows(evaluate_run(reacher, Settings(episodes=3)), policy="deterministic")
-    found = evaluate_robustness(reacher, Threat(("random", "mad"), (0.0, 0.3), episodes=3))
+    found = attack(reacher, "random,mad", (0.0, 0.3), episodes=3)
     measures = ["episode", "return", "length", "action_change", "smoothness"]
-    for attack in ("random", "mad"):
-        still = rows(found, attack=attack, radius=0.0)
+    for name in ("random", "mad"):
+        still = rows(found, attack=name, radius=0.0)
         pd.testing.assert_frame_equal(still[measures], clean[measures], check_exact=True)
-        moved = rows(found, attack=attack, radius=0.3)
+        moved = rows(found, attack=name, radius=0.3)
         assert (moved["return"] != clean["return"]).all()
 
 
 def test_all_radii_and_attacks_have_the_same_episodes(tmp_path, made):
     args = write_checkpoint(tmp_path)
-    evaluate_robustness(tmp_path, Threat(("random", "mad"), (0.0, 0.1), episodes=2))
+    attack(tmp_path, "random,mad", (0.0, 0.1), episodes=2)
     toys = [toy for toy in made if toy.seeds]
     assert [toy.seeds[0] for toy in toys] == [episode_seeds(args, i)[0] for i in range(2)] * 3
     assert len({toy.seen[0] for toy in toys}) == 2
     assert all(toy.closed for toy in toys)
 
 
-@pytest.mark.parametrize("attack", robustness.ATTACKS)
-def test_an_episode_does_not_depend_on_the_others(reacher, attack, monkeypatch):
+@pytest.mark.parametrize("name", robustness.ATTACKS)
+def test_an_episode_does_not_depend_on_the_others(reacher, name, monkeypatch):
     monkeypatch.setattr(robustness, "SLOTS", 3)
+    monkeypatch.setattr(sarsa, "UPDATES", 20)
     state = torch.get_rng_state()
-    few, many = (
-        pd.concat(robustness.evaluate(read_checkpoint(reacher), Threat((attack,), (0.3,), "l2", n)))
-        for n in (1, 4)
-    )
+    few, many = (attack(reacher, name, (0.3,), "l2", episodes=n) for n in (1, 4))
     pd.testing.assert_frame_equal(few, many[:1], check_exact=True)
     assert len(set(many["return"])) == 4
     assert torch.equal(state, torch.get_rng_state())
@@ -141,7 +144,7 @@ def test_the_attack_sees_normalized_observations(tmp_path, made, monkeypatch):
         return torch.zeros_like(obs)
 
     monkeypatch.setattr(robustness.attacks, "mad", spy)
-    evaluate_robustness(tmp_path, Threat(("mad",), (0.1,), "l2", 2))
+    attack(tmp_path, "mad", (0.1,), "l2", 2)
     toys = [toy for toy in made if toy.seeds]
     assert [x.shape for x in seen] == [(robustness.SLOTS, 1)] * 4
     for step, obs in enumerate(seen):
@@ -155,7 +158,7 @@ def test_actions_that_are_not_finite_are_told(tmp_path):
     saved["learner"]["actor"]["mean.2.bias"].fill_(math.nan)
     torch.save(saved, tmp_path / "checkpoint.pt")
     with pytest.raises(EvaluationError, match=f"{tmp_path}.*actions that are not finite"):
-        evaluate_robustness(tmp_path, Threat(("random",), (0.1,), episodes=1))
+        attack(tmp_path, "random", (0.1,), episodes=1)
     assert all(toy.closed for toy in Toy.made if toy.seeds)
 
 
@@ -164,7 +167,7 @@ def test_actions_that_are_not_finite_are_told(tmp_path):
 
 def test_both_files_say_what_was_asked(tmp_path):
     write_checkpoint(tmp_path)
-    found = evaluate_robustness(tmp_path, Threat(("mad", "random"), (0.1, 0.0), "l2", 2))
+    found = attack(tmp_path, "mad,random", (0.1, 0.0), "l2", 2)
     pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "robustness.csv"), found)
     assert found["attack"].tolist() == ["mad"] * 4 + ["random"] * 4
     assert found["radius"].tolist() == [0, 0, 0.1, 0.1] * 2
@@ -176,18 +179,15 @@ def test_both_files_say_what_was_asked(tmp_path):
 
 def test_a_second_call_reads_what_the_first_found(tmp_path, monkeypatch):
     write_checkpoint(tmp_path)
-    threat = Threat(("random",), (0.1,), episodes=2)
-    first = evaluate_robustness(tmp_path, threat)
-    with monkeypatch.context() as patch:
-        patch.setattr(robustness, "evaluate", lambda *_: 1 / 0)
-        pd.testing.assert_frame_equal(evaluate_robustness(tmp_path, threat), first)
+    first = attack(tmp_path, "random", (0.1,))
+    monkeypatch.setattr(robustness, "evaluate", lambda *_: 1 / 0)
+    pd.testing.assert_frame_equal(attack(tmp_path, "random", (0.1,)), first)
+    for changed in ({"radii": (0.2,)}, {"norm": "l2"}, {"episodes": 3}, {"names": "mad"}):
         with pytest.raises(ZeroDivisionError):
-            evaluate_robustness(tmp_path, Threat(("random",), (0.2,), episodes=2))
+            attack(tmp_path, **{"names": "random", "radii": (0.1,), **changed})
     write_checkpoint(tmp_path, log_std=-2.0)  # another checkpoint
-    with monkeypatch.context() as patch:
-        patch.setattr(robustness, "evaluate", lambda *_: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
-            evaluate_robustness(tmp_path, threat)
+    with pytest.raises(ZeroDivisionError):
+        attack(tmp_path, "random", (0.1,))
 
 
 def test_it_shows_how_far_it_is(tmp_path, monkeypatch):
@@ -200,7 +200,7 @@ def test_it_shows_how_far_it_is(tmp_path, monkeypatch):
         totals.append((len(parts), total))
         return parts
 
-    evaluate_robustness(tmp_path, Threat(("random", "critic"), (0.0, 0.1), episodes=3), show)
+    attack(tmp_path, "random,critic", (0.0, 0.1), episodes=3, show=show)
     assert totals == [(6, 6)]  # two groups of no attack, and of each attack
 
 
@@ -208,23 +208,22 @@ def test_it_shows_how_far_it_is(tmp_path, monkeypatch):
 
 
 def test_flags_are_parsed():
-    assert Threat.parse("random,mad", "0,0.05", "l2", 7) == Threat(
-        ("random", "mad"), (0.0, 0.05), "l2", 7
+    assert Threat.parse("random,mad", "0,0.05", "l2") == Threat(
+        ("random", "mad"), (0.0, 0.05), "l2"
     )
 
 
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (("noise", "0", "l2", 1), "attack must be some of random,mad,critic, got 'noise'"),
-        (("", "0", "l2", 1), "attack must be some of random,mad,critic, got ''"),
-        (("mad,mad", "0", "l2", 1), "attack names one twice"),
-        (("mad", "0.1,0.10", "l2", 1), "radius names one twice"),
-        (("mad", "small", "l2", 1), "radius must be numbers with commas between them, got 'small'"),
-        (("mad", "-1", "l2", 1), "radius must be finite and at least 0"),
-        (("mad", "nan", "l2", 1), "radius must be finite and at least 0"),
-        (("mad", "0", "l1", 1), "norm must be one of .* got 'l1'"),
-        (("mad", "0", "l2", 0), "episodes must be at least 1, got 0"),
+        (("noise", "0", "l2"), "attack must be some of random,mad,critic,sarsa, got 'noise'"),
+        (("", "0", "l2"), "attack must be some of random,mad,critic,sarsa, got ''"),
+        (("mad,mad", "0", "l2"), "attack names one twice"),
+        (("mad", "0.1,0.10", "l2"), "radius names one twice"),
+        (("mad", "small", "l2"), "radius must be numbers with commas between them, got 'small'"),
+        (("mad", "-1", "l2"), "radius must be finite and at least 0"),
+        (("mad", "nan", "l2"), "radius must be finite and at least 0"),
+        (("mad", "0", "l1"), "norm must be one of .* got 'l1'"),
     ],
 )
 def test_bad_flags_are_refused_by_name(flags, message):
@@ -234,4 +233,10 @@ def test_bad_flags_are_refused_by_name(flags, message):
 
 def test_agents_of_coinrun_are_refused(coinrun_run):
     with pytest.raises(EvaluationError, match="run of ppo_reg_coinrun: attacks are for control"):
-        evaluate_robustness(coinrun_run[0], Threat())
+        attack(coinrun_run[0], "random", (0.1,))
+
+
+def test_settings_that_would_be_ignored_are_refused(tmp_path):
+    write_checkpoint(tmp_path)
+    with pytest.raises(EvaluationError, match="leave out --levels 3"):
+        evaluate_robustness(tmp_path, Settings(levels=3), Threat(("random",)))
