@@ -14,10 +14,11 @@ from harness.report.figures.arms import draw_arms, sweep
 from harness.report.figures.claims import findings, psi_and_reward
 from harness.report.figures.curves import CONDITIONING, LEARNING, draw_measures
 from harness.report.figures.jacobian import squares
+from harness.report.figures.robustness import return_against_radius
 from harness.report.figures.scores import score_cells
 from harness.report.figures.success import success_curves
 from harness.report.results import Results
-from harness.report.tables import arms, conditioning, smoothness, table1, table2
+from harness.report.tables import arms, conditioning, robustness, smoothness, table1, table2
 
 Picture = tuple[str, str]
 """a title and a file's name"""
@@ -112,6 +113,7 @@ def _control(results: Results, found: list[claims.Claim], folder: Path) -> list[
         _scores("Table 1: training scores, beside the paper's", results, cells, folder),
         _final(results, final, folder),
         _smoothness(results, folder),
+        _robustness(results, folder),
         _conditioning(results, folder),
     ]
     return [section for section in sections if section.rows or section.pictures]
@@ -170,6 +172,21 @@ def _smoothness(results: Results, folder: Path) -> Section:
     table.to_csv(folder / "smoothness.csv", index=False)
     header, rows = smoothness.to_rows(table)
     return Section("Smoothness of the final policies' actions", header, rows, smoothness.NOTES)
+
+
+def _robustness(results: Results, folder: Path) -> Section:
+    """Returns under attack, of the agents that `evaluate --attack` has attacked."""
+    title = "Robustness: final policies under attack"
+    frame = robustness.robustness_frame(results)
+    found = robustness.standings(results, frame)
+    if not found:
+        return Section(title)
+    return_against_radius(results, frame, folder / "robustness.png")
+    robustness.to_frame(found).to_csv(folder / "robustness.csv", index=False)
+    header, rows = robustness.to_rows(found)
+    picture = ("Return under the strongest attack: agents are dots, lines their medians",
+               "robustness.png")  # fmt: skip
+    return Section(title, header, rows, robustness.NOTES, (picture,))
 
 
 def _arms(results: Results, folder: Path) -> Section:

@@ -19,6 +19,7 @@ from harness.report.tables.table1 import Cell, make_cells
 from harness.suite import load_suite
 from tests.harness.conftest import make_episodes, write_run
 from tests.harness.report.conftest import UPDATES, make_games, make_study
+from tests.harness.report.tables.test_robustness import attack_all
 
 VOID = {"meta", "img", "br", "hr", "link"}
 OPTIONAL = {"html"}  # end tags that HTML does not ask for
@@ -172,6 +173,18 @@ def test_arms_have_a_table_and_a_picture(study, tmp_path):
     rows = {cells[0]: cells[1:4] for cells in page.cells if len(cells) == 9}
     assert rows["size of delta=2"] == ["Hopper", "PPO", "-4.00 [-4.00, -4.00]" + RESTS]
     assert pd.read_csv(tmp_path / "arms.csv")["reward"].tolist() == [3.0, -4.0]
+
+
+def test_attacked_agents_have_a_table_and_a_picture(study, tmp_path):
+    results = study(lambda *_: 1.0, agents=4, final=lambda *_: 1.0)
+    attack_all(results)
+    write_report(results, tmp_path)
+    page = Page((tmp_path / "report.html").read_text())
+    assert "robustness.png" in [image["src"] for image in page.images]
+    assert "Robustness: final policies under attack" in page.headings
+    rows = [cells for cells in page.cells if cells[:3] == ["Hopper", "PPO", "0.1 l∞"]]
+    assert [row[4:9] for row in rows] == [["200", "90.0", "20.0", "critic", "10%"]]
+    assert pd.read_csv(tmp_path / "robustness.csv")["strongest"].tolist() == ["critic", "mad"]
 
 
 @pytest.mark.parametrize("runs", [0, 1])
