@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import signal
 import sys
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import pandas as pd
 import rich.progress
@@ -191,6 +192,9 @@ def evaluate(
     repeats: int = 20,
     unseen: Unseen = "next",
     device: str = "auto",
+    attack: str = "",
+    radius: str = "",
+    norm: Literal["linf", "l2"] = "linf",
 ) -> None:
     """Play the final policy of trained agents, from seeds that training does not use.
 
@@ -204,6 +208,9 @@ def evaluate(
     Every episode goes to evaluation.csv in the run's folder; a second call with the same settings
     reads it.
 
+    With --attack, on control tasks: episodes with the policy's mean where an adversary perturbs
+    what the agent sees, after it is normalized. They go to robustness.csv.
+
     Args:
         run_dirs: Folders of runs, each with its checkpoint.pt.
         episodes: Control tasks: episodes with the policy's mean, and as many with sampled actions.
@@ -214,9 +221,16 @@ def evaluate(
             For agents trained with --restrict-themes, themes are the next levels without and with
             unseen themes.
         device: CoinRun: cpu, cuda or cuda:1; auto: a GPU if there is one.
+        attack: Some of random, mad (the largest change of the action), critic (the lowest value)
+            and sarsa (the worst action by a Q that is learnt for it), such as random,mad,critic.
+        radius: Sizes of the perturbation, in deviations of the observations; by default 0,0.05,0.1.
+        norm: What a perturbation's size is: of its largest number, or its Euclidean length.
     """
+    from harness.evaluation.robustness import evaluate_robustness, parse_threat
     from harness.evaluation.runs import evaluate_run  # PyTorch and the simulators
 
+    threat = parse_threat(attack, radius, norm)
+    judge = functools.partial(evaluate_robustness, threat=threat) if threat else evaluate_run
     if not run_dirs:
         raise EvaluationError("name at least one folder of a run, such as results/smoke/<run id>")
     settings = Settings(episodes, levels, repeats, unseen, device)
@@ -231,7 +245,7 @@ def evaluate(
             def show(parts: Iterable[Any], total: int, name: str = name) -> Iterable[Any]:
                 return bar.track(parts, total, description=name)
 
-            found[str(path)] = evaluate_run(path, settings, show)
+            found[str(path)] = judge(path, settings, show=show)
             say(f"[{i}/{len(run_dirs)}] {name} evaluated", markup=False)
     for table in evaluation_tables({Path(path).resolve().name: x for path, x in found.items()}):
         console.print(table)

@@ -81,15 +81,27 @@ def show_outcome(outcome: Outcome, store: Store) -> None:
 
 
 def evaluation_tables(found: dict[str, pd.DataFrame]) -> list[Table]:
-    """What evaluations found, by run: a table of control agents, and one of CoinRun's."""
+    """What evaluations found, by run: of control agents, under attack, and CoinRun's."""
     control = Table("run", "actions", "episodes", "return", "length", "|change|", "Sm")
     levels = Table("run", "levels", "actions", "success rate", "95% interval over levels")
+    attacked = Table("run", "attack", "radius", "norm", "episodes", "return", "length", "|change|")
     for run, episodes in found.items():
         if "split" in episodes:
             for (split, policy), part in episodes.groupby(["split", "policy"]):
                 rate = estimate_success([success_matrix(part)])
                 interval = f"{100 * rate.low:.1f} to {100 * rate.high:.1f}"
                 levels.add_row(run, split, policy, f"{100 * rate.mean:.1f}%", interval)
+            continue
+        if "attack" in episodes:
+            for (attack, radius, norm), part in episodes.groupby(
+                ["attack", "radius", "norm"], sort=False
+            ):
+                mean = part.mean(numeric_only=True)
+                attacked.add_row(
+                    run, attack, f"{radius:g}", norm, str(len(part)),
+                    f"{mean['return']:.1f} ± {part['return'].std(ddof=0):.1f}",
+                    f"{mean['length']:.0f}", f"{mean['action_change']:.3f}",
+                )  # fmt: skip
             continue
         for policy, part in episodes.groupby("policy"):
             mean = part.mean(numeric_only=True)
@@ -99,7 +111,7 @@ def evaluation_tables(found: dict[str, pd.DataFrame]) -> list[Table]:
                 f"{mean['length']:.0f}", f"{mean['action_change']:.3f}",
                 f"{mean['smoothness']:.2e}",
             )  # fmt: skip
-    return [table for table in (control, levels) if table.row_count]
+    return [table for table in (control, attacked, levels) if table.row_count]
 
 
 def show_others(found: list[Results]) -> None:

@@ -55,11 +55,11 @@ class Threat:
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.attacks if name not in ATTACKS]
-        if unknown or not self.attacks:
+        if unknown:
             raise EvaluationError(
                 f"attack must be some of {','.join(ATTACKS)}, got {','.join(self.attacks)!r}"
             )
-        if not self.radii or not all(0 <= radius < np.inf for radius in self.radii):
+        if not all(0 <= radius < np.inf for radius in self.radii):
             raise EvaluationError(f"radius must be finite and at least 0, got {self.radii}")
         for name, values in (("attack", self.attacks), ("radius", self.radii)):
             if len(set(values)) < len(values):
@@ -67,17 +67,22 @@ class Threat:
         if self.norm not in get_args(Norm):
             raise EvaluationError(f"norm must be one of {get_args(Norm)}, got {self.norm!r}")
 
-    @classmethod
-    def parse(cls, attack: str, radius: str, norm: Norm) -> Threat:
-        """From flags such as `--attack random,mad --radius 0,0.05,0.1`."""
-        try:
-            radii = tuple(float(word) for word in radius.split(","))
-        except ValueError:
-            raise EvaluationError(
-                f"radius must be numbers with commas between them, got {radius!r}"
-            ) from None
-        names = tuple(word.strip() for word in attack.split(","))
-        return cls(names, radii, norm)
+
+def parse_threat(attack: str, radius: str, norm: Norm) -> Threat | None:
+    """From flags such as `--attack random,mad --radius 0,0.05,0.1`; None where none is given."""
+    if not attack:
+        if radius or norm != "linf":
+            raise EvaluationError("--radius and --norm need --attack, such as random,mad,critic")
+        return None
+    names = tuple(word.strip() for word in attack.split(","))
+    if not radius:
+        return Threat(names, norm=norm)
+    try:
+        return Threat(names, tuple(float(word) for word in radius.split(",")), norm)
+    except ValueError:
+        raise EvaluationError(
+            f"radius must be numbers with commas between them, got {radius!r}"
+        ) from None
 
 
 def evaluate_robustness(

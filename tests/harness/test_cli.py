@@ -9,7 +9,7 @@ import sys
 import pandas as pd
 import pytest
 
-from harness.evaluation import runs
+from harness.evaluation import robustness, runs
 from harness.files import write_json
 from harness.launchers.local import ROOT
 from harness.schema import suite_names
@@ -280,6 +280,26 @@ def test_evaluate_takes_several_runs_of_both_kinds(run_cli, asked, tmp_path):
     assert "[2/3] levels-2 evaluated" in out
 
 
+def test_evaluate_attacks_where_it_is_asked_to(run_cli, monkeypatch, tmp_path):
+    found = []
+
+    def evaluate_robustness(path, settings, show, threat):
+        found.append((path, settings, threat))
+        rows = [("mad", 0.1, "l2", i, x, 10, 0.5, 0.01) for i, x in enumerate((10.0, 20.0))]
+        return pd.DataFrame(rows, columns=robustness.COLUMNS)
+
+    monkeypatch.setattr(robustness, "evaluate_robustness", evaluate_robustness)
+    flags = ["--attack", "mad,random", "--radius", "0.1", "--norm", "l2", "--episodes", 2]
+    status, out = run_cli("evaluate", tmp_path / "run", *flags)
+    assert status == 0, out
+    threat = robustness.Threat(("mad", "random"), (0.1,), "l2")
+    assert found == [(tmp_path / "run", runs.Settings(episodes=2), threat)]
+    assert rows(out) == [["run", "mad", "0.1", "l2", "2", "15.0", "±", "5.0", "10", "0.500"]]
+    status, out = run_cli("evaluate", tmp_path / "run", "--radius", "0.1")
+    assert (status, len(found)) == (1, 1)
+    assert out.startswith("error: --radius and --norm need --attack")
+
+
 def test_a_run_that_diverged_is_passed_over(run_cli, asked, tmp_path):
     bad, good = tmp_path / "control-bad", tmp_path / "control-good"
     bad.mkdir()
@@ -374,7 +394,7 @@ def test_help_explains_every_flag():
 def test_help_of_evaluate_says_what_each_flag_is_for():
     words = [sys.executable, "-m", "harness", "evaluate", "--help"]
     out = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    for flag in ("--episodes", "--levels", "--repeats", "--unseen", "--device"):
+    for flag in ("--episodes", "--levels", "--repeats", "--unseen", "--device", "--attack"):
         assert flag in out
     assert "{next,unbounded,themes}" in out
     assert "final policy" in out

@@ -18,6 +18,7 @@ from harness.evaluation.robustness import (
     COLUMNS,
     Threat,
     evaluate_robustness,
+    parse_threat,
 )
 from harness.evaluation.runs import evaluate_run
 from harness.evaluation.settings import EvaluationError, Settings
@@ -208,7 +209,9 @@ def test_it_shows_how_far_it_is(tmp_path, monkeypatch):
 
 
 def test_flags_are_parsed():
-    assert Threat.parse("random,mad", "0,0.05", "l2") == Threat(
+    assert parse_threat("", "", "linf") is None
+    assert parse_threat("mad", "", "linf") == Threat(("mad",), (0.0, 0.05, 0.1), "linf")
+    assert parse_threat("random,mad", "0,0.05", "l2") == Threat(
         ("random", "mad"), (0.0, 0.05), "l2"
     )
 
@@ -217,7 +220,9 @@ def test_flags_are_parsed():
     ("flags", "message"),
     [
         (("noise", "0", "l2"), "attack must be some of random,mad,critic,sarsa, got 'noise'"),
-        (("", "0", "l2"), "attack must be some of random,mad,critic,sarsa, got ''"),
+        (("", "0.1", "linf"), "--radius and --norm need --attack"),
+        (("", "", "l2"), "--radius and --norm need --attack"),
+        (("mad,", "", "l2"), "attack must be some of .* got 'mad,'"),
         (("mad,mad", "0", "l2"), "attack names one twice"),
         (("mad", "0.1,0.10", "l2"), "radius names one twice"),
         (("mad", "small", "l2"), "radius must be numbers with commas between them, got 'small'"),
@@ -228,7 +233,7 @@ def test_flags_are_parsed():
 )
 def test_bad_flags_are_refused_by_name(flags, message):
     with pytest.raises(EvaluationError, match=message):
-        Threat.parse(*flags)
+        parse_threat(*flags)
 
 
 def test_agents_of_coinrun_are_refused(coinrun_run):
