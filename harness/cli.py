@@ -22,12 +22,13 @@ from harness.estimate import EstimateError, measure
 from harness.evaluation.settings import EvaluationError, Settings, Unseen
 from harness.extension import refuse_extension
 from harness.launchers.groups import make_groups
-from harness.launchers.local import Outcome, cores, run_local
+from harness.launchers.local import LocalLauncher
 from harness.pack import pack
 from harness.progress import Progress
-from harness.provenance import ROOT
+from harness.provenance import ROOT, cores
 from harness.report.cost import measured_in_turn
 from harness.report.results import TIMED, load_results
+from harness.scheduler import Outcome, run_groups
 from harness.schema import SuiteError, check_known, suite_names
 from harness.show import (
     console,
@@ -120,7 +121,7 @@ def run_all(
     if todo:
         members = [spec for group in groups for spec in group]  # those that share a run's process
         with Progress(console, store, members) as progress:
-            outcome = run_local(groups, store, jobs, progress)
+            outcome = run_groups(groups, store, LocalLauncher(jobs), progress)
 
     suites = [_whole(name, plan, total_timesteps) for name, plan in plans.items()]
     found = [load_results(one, store) for one in suites]

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from harness.launchers.local import ROOT
+from harness.provenance import ROOT
 from harness.suite import SuiteError
 
 ALGORITHMS = {"PPO": "ppo_reg", "TRPO": "trpo_reg"}

@@ -10,8 +10,9 @@ from rich.console import Console
 
 from harness.identity import make_args
 from harness.launchers.groups import Group
-from harness.launchers.local import run_local
+from harness.launchers.local import LocalLauncher
 from harness.progress import Progress
+from harness.scheduler import run_groups
 from harness.store import Store
 from harness.suite import RunSpec
 
@@ -50,7 +51,7 @@ def measure(groups: list[Group], jobs: int, console: Console) -> list[Cost]:
         store = Store(Path(folder))
         runs = [run for group in samples.values() for run in group]
         with Progress(console, store, runs) as progress:
-            outcome = run_local(list(samples.values()), store, jobs, progress)
+            outcome = run_groups(list(samples.values()), store, LocalLauncher(jobs), progress)
         for run in outcome.failed:
             raise EstimateError(f"{run.run_id} failed:\n{store.log_tail(run)}")
         return [_cost(kind, found, samples[kind][0], store) for kind, found in kinds.items()]

@@ -12,12 +12,12 @@ from rich.console import Console
 from rich.table import Table
 
 from harness.estimate import Cost
-from harness.launchers.local import Outcome
 from harness.progress import duration
 from harness.provenance import cores
 from harness.report.page import write_page, write_report
 from harness.report.part import Part
 from harness.report.results import Results
+from harness.scheduler import Outcome
 from harness.schema import suite_names
 from harness.statistics import estimate_success, success_matrix
 from harness.store import Store

@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import nn
 
-from harness.launchers.local import cores
+from harness.provenance import cores
 from tests.benchmarks.test_penalty import (
     exact_svd,
     jacobian_regularization,

@@ -11,7 +11,7 @@ import pytest
 
 from harness.evaluation import robustness, runs
 from harness.files import write_json
-from harness.launchers.local import ROOT
+from harness.provenance import ROOT
 from harness.schema import suite_names
 from harness.suite import load_suite
 from tests.harness.conftest import make_episodes, write_run

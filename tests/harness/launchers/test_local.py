@@ -19,10 +19,12 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from harness.launchers import local
+from harness import work
 from harness.launchers.groups import commands
-from harness.launchers.local import ROOT, cores, run_local
+from harness.launchers.local import LocalLauncher
 from harness.progress import Progress
+from harness.provenance import ROOT, cores
+from harness.scheduler import run_groups
 from harness.store import Store
 from harness.suite import load_suite
 from tests.harness.conftest import write_run
@@ -31,7 +33,7 @@ from tests.harness.conftest import write_run
 def run(specs, store, jobs=2):
     """Each in a process of its own."""
     with Progress(Console(file=io.StringIO()), store, specs) as progress:
-        return run_local([[spec] for spec in specs], store, jobs, progress)
+        return run_groups([[spec] for spec in specs], store, LocalLauncher(jobs), progress)
 
 
 def start_run_all(suite_file: Path, results: Path) -> subprocess.Popen:
@@ -158,7 +160,7 @@ def trained(monkeypatch):
         paths = [str(store.path(spec).resolve()) for spec in group]
         return [[sys.executable, "-c", code, *paths]]
 
-    monkeypatch.setattr(local, "commands", made)
+    monkeypatch.setattr(work, "commands", made)
     return seen
 
 
@@ -170,7 +172,7 @@ def agents(suite):
 
 def run_group(group, store):
     with Progress(Console(file=io.StringIO()), store, group) as progress:
-        return run_local([group], store, 2, progress)
+        return run_groups([group], store, LocalLauncher(2), progress)
 
 
 def test_a_group_is_trained_together_and_says_so(store, agents, trained):
@@ -257,7 +259,7 @@ def test_one_agent_of_a_population_diverges_and_the_others_are_done(
     store, agents, trained, monkeypatch
 ):
     code = TOUCH + f"(folder / 'diverged.json').write_text({DIVERGED!r})"  # in the last folder
-    monkeypatch.setattr(local, "commands", functools.partial(local.commands, code=code))
+    monkeypatch.setattr(work, "commands", functools.partial(work.commands, code=code))
     assert run_group(agents, store).done == agents
     assert [store.state(spec) for spec in agents] == ["done", "diverged"]
     done = json.loads(store.path(agents[1], "done.json").read_text())
@@ -289,7 +291,7 @@ def scripts(monkeypatch):
             path = store.path(group[0]).resolve()
             return [[sys.executable, "-c", code, str(path)] for code in codes]
 
-        monkeypatch.setattr(local, "commands", made)
+        monkeypatch.setattr(work, "commands", made)
 
     return use
 
@@ -344,7 +346,7 @@ def test_a_run_that_is_stopped_goes_on_when_it_is_run_again(store, evaluated, sc
 
     progress = Stopping(Console(file=io.StringIO()), store, [evaluated])
     with pytest.raises(KeyboardInterrupt):
-        run_local([[evaluated]], store, 1, progress)
+        run_groups([[evaluated]], store, LocalLauncher(1), progress)
     assert store.state(evaluated) == "interrupted"
     assert not store.path(evaluated, "evaluation.csv").exists()
     assert store.path(evaluated, "metrics.csv").exists() == (when == "judge")
@@ -355,7 +357,7 @@ def test_a_run_that_is_stopped_goes_on_when_it_is_run_again(store, evaluated, sc
 
 @pytest.mark.parametrize(("jobs", "share"), [(1, 4), (2, 2), (3, 1), (9, 1)])
 def test_a_run_has_its_share_of_the_cores(store, evaluated, scripts, monkeypatch, jobs, share):
-    monkeypatch.setattr(local, "cores", lambda: 4)
+    monkeypatch.setattr("harness.launchers.local.cores", lambda: 4)
     show = "print(os.environ['OMP_NUM_THREADS'])"
     scripts(say("train", show), say("judge", show))
     run([evaluated], store, jobs)
@@ -397,7 +399,7 @@ def test_every_agent_of_a_group_is_evaluated(store, suite):
     group = [dataclasses.replace(spec, evaluation=asked) for spec in suite.runs[:2]]
     assert [spec.args["agent"] for spec in group] == [0, 1]
     progress = Progress(Console(file=io.StringIO()), store, group)
-    assert run_local([group], store, 1, progress).done == group
+    assert run_groups([group], store, LocalLauncher(1), progress).done == group
     returns = []
     for spec in group:
         content = store.path(spec, "evaluation.csv").read_bytes()
