@@ -38,18 +38,18 @@ def subsets(n: int) -> np.ndarray:
 def sign_flip_test(differences: np.ndarray) -> np.ndarray:
     """Two-sided p of the hypothesis that differences `[..., n]` are symmetric around 0: `[...]`.
 
-    Exact to n = 12. NaN entries are pairs that do not exist. NaN where no pair does.
+    NaN entries are pairs that do not exist. The test is exact to 12 pairs that do. NaN where no
+    pair does.
     """
     rows, shape = _rows(differences)
-    flips = subsets(rows.shape[1])
-    p = np.empty(len(rows))
-    for part in _chunks(len(rows), len(flips)):
-        sums = np.nan_to_num(rows[part]) @ flips.T
-        slack = 1e-9 * np.nansum(np.abs(rows[part]), axis=1, keepdims=True)
+    p = np.full(len(rows), np.nan)
+    for places, pairs in _by_pairs(rows):
+        flips = subsets(pairs.shape[1])
+        sums = pairs @ flips.T
+        slack = 1e-9 * np.abs(pairs).sum(axis=1, keepdims=True)
         at_least = np.count_nonzero(sums <= slack, axis=1)  # flipping them leaves no smaller mean
         at_most = np.count_nonzero(sums >= -slack, axis=1)
-        p[part] = 2 * np.minimum(at_least, at_most) / len(flips)
-    p[np.isnan(rows).all(axis=1)] = np.nan
+        p[places] = 2 * np.minimum(at_least, at_most) / len(flips)
     return np.minimum(p, 1.0).reshape(shape)
 
 
@@ -59,34 +59,25 @@ def sign_flip_interval(
     """Shifts of differences `[..., n]` that the test does not reject at `alpha`: low and high.
 
     A shift is rejected where too few subsets have a smaller mean, or a larger one, so the ends are
-    order statistics of the subsets' means. NaN where n is too small to reject any shift.
+    order statistics of the subsets' means. NaN where too few pairs exist to reject any shift.
     """
     rows, shape = _rows(differences)
-    low, high = np.empty(len(rows)), np.empty(len(rows))
-    for part in _chunks(len(rows), len(subsets(rows.shape[1]))):
-        means, rank = _subset_means(rows[part], alpha)
-        low[part] = _order_statistic(means, rank)
-        high[part] = -_order_statistic(-means, rank)
+    low = np.full(len(rows), np.nan)
+    high = np.full(len(rows), np.nan)
+    for places, pairs in _by_pairs(rows):
+        flips = subsets(pairs.shape[1])
+        sizes = flips.sum(axis=1)
+        means = pairs @ flips[sizes > 0].T / sizes[sizes > 0]
+        rank = _tail(pairs.shape[1], alpha) - np.count_nonzero(sizes == 0)
+        if rank >= 0:
+            low[places] = np.partition(means, rank, axis=1)[:, rank]
+            high[places] = -np.partition(-means, rank, axis=1)[:, rank]
     return low.reshape(shape), high.reshape(shape)
 
 
-def _subset_means(rows: np.ndarray, alpha: float) -> tuple[np.ndarray, np.ndarray]:
-    """Means of the subsets, NaN for those without a pair, and the rank of the interval's ends."""
-    flips = subsets(rows.shape[1])
-    sizes = (~np.isnan(rows)).astype(np.float64) @ flips.T
-    with np.errstate(invalid="ignore"):
-        means = np.nan_to_num(rows) @ flips.T / sizes
-    empty = np.count_nonzero(sizes == 0, axis=1)
-    rank = np.floor(alpha / 2 * len(flips) + 1e-9).astype(int) - empty
-    return means, rank
-
-
-def _order_statistic(means: np.ndarray, rank: np.ndarray) -> np.ndarray:
-    """The entry of this rank, from 0, in each row of means; NaN where the rank is negative."""
-    ranks = np.unique(np.maximum(rank, 0))
-    ordered = np.partition(means, ranks, axis=1)  # NaN comes last
-    found = np.take_along_axis(ordered, np.maximum(rank, 0)[:, None], axis=1)[:, 0]
-    return np.where(rank < 0, np.nan, found)
+def _tail(n: int, alpha: float) -> int:
+    """Subsets of n pairs that make up half of `alpha`."""
+    return int(np.floor(alpha / 2 * len(subsets(n)) + 1e-9))
 
 
 def smallest_n(share: float = 1.0, alpha: float = ALPHA) -> int:
@@ -108,23 +99,29 @@ def detectable_difference(
         share: The share of `ALPHA` that the test has.
 
     Returns:
-        The difference; NaN where n is too small to reach the level at all.
+        The difference; NaN where n is too small to reach the level at all, or there is no test.
     """
-    return spread * np.vectorize(_detectable_unit, otypes=[float])(n, ALPHA * np.asarray(share))
+    unit = np.vectorize(_detectable_at, otypes=[float])
+    return spread * unit(n, ALPHA * np.asarray(share))
+
+
+def _detectable_at(n: int, alpha: float) -> float:
+    """The same for differences of deviation 1; NaN where there is no such test."""
+    return np.nan if np.isnan(alpha) else _detectable_unit(int(n), _tail(int(n), alpha))
 
 
 @functools.cache
-def _detectable_unit(n: int, alpha: float) -> float:
-    """The same for differences of deviation 1, normally distributed.
+def _detectable_unit(n: int, tail: int) -> float:
+    """The same for normal differences of deviation 1 and a test that rejects `tail` subsets a side.
 
     A shift is found where the interval's lower end, shifted with it, is above 0. So it is the 80%
     quantile of how far below 0 that end lies without a shift. Student's formula promises too much:
     at a level that only the smallest p reaches, all signs must agree.
     """
-    if n < 2 or 2.0 ** (1 - n) > alpha * (1 + 1e-9):
+    if n < 2 or tail < 1:
         return np.nan
     drawn = np.random.default_rng(n).normal(size=(2000, n))
-    low, _ = sign_flip_interval(drawn, alpha)
+    low, _ = sign_flip_interval(drawn, 2 * tail / len(subsets(n)))
     return float(np.quantile(-low, POWER))
 
 
@@ -133,6 +130,13 @@ def _rows(differences: np.ndarray) -> tuple[np.ndarray, tuple[int, ...]]:
     return values.reshape(-1, values.shape[-1]), values.shape[:-1]
 
 
-def _chunks(rows: int, width: int) -> Iterator[slice]:
-    size = max(1, CHUNK // width)
-    return (slice(start, start + size) for start in range(0, rows, size))
+def _by_pairs(rows: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Rows with equally many pairs, a chunk at a time: their places, and their pairs `[rows, k]`."""
+    present = ~np.isnan(rows)
+    counts = present.sum(axis=1)
+    for count in np.unique(counts[counts > 0]):
+        places = np.flatnonzero(counts == count)
+        pairs = rows[places][present[places]].reshape(-1, count)
+        size = max(1, CHUNK // len(subsets(int(count))))
+        for start in range(0, len(places), size):
+            yield places[start : start + size], pairs[start : start + size]

@@ -82,6 +82,19 @@ def test_missing_pairs_do_not_count():
     assert np.isnan(sign_flip_interval(np.full(4, np.nan))).all()
 
 
+def test_what_is_exact_is_counted_in_pairs_not_in_columns():
+    """Six pairs in twenty columns have 64 subsets, and not 4096 drawn ones."""
+    there = np.array([3.0, 9.0, 4.0, 8.0, 5.0, 7.0])
+    holes = np.full(20, np.nan)
+    holes[[0, 4, 7, 11, 15, 19]] = there
+    assert sign_flip_test(holes) == 2 / 64
+    assert sign_flip_interval(holes) == (3.0, 9.0)
+    beside = np.arange(1.0, 21.0)  # a row that has all pairs does not change that
+    assert sign_flip_test(np.stack([holes, beside]))[0] == 2 / 64
+    holes[19] = np.nan
+    assert np.isnan(sign_flip_interval(holes)).all()
+
+
 numbers = st.lists(st.integers(-50, 50), min_size=6, max_size=9)
 
 
