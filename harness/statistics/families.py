@@ -7,6 +7,25 @@ import numpy as np
 ALPHA = 0.05
 
 
+def shares_left(corrected: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """The share of `ALPHA` that each test has once decided ones have passed theirs on.
+
+    That is its weight over the weights of all undecided tests and itself. What a test of this share
+    calls is what `holm` calls, as the other tests have turned out.
+
+    Args:
+        corrected: What `holm` gives, `[..., tests]`; NaN for a test that was not made.
+        weights: A weight for each test.
+    """
+    made = ~np.isnan(corrected)
+    weights = np.where(made, weights, 0.0)
+    decided = made & (corrected <= ALPHA)
+    undecided = np.where(decided, 0.0, weights).sum(axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore"):
+        share = weights / (undecided + np.where(decided, weights, 0.0))
+    return np.where(made, share, np.nan)
+
+
 def holm(p: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
     """Holm's correction of the p-values `p`, `[..., tests]`, with a weight for each test.
 

@@ -13,8 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from harness.statistics.correlation import permuted_correlations, summarize
-from harness.statistics.families import ALPHA, holm
+from harness.statistics.correlation import (
+    Correlation,
+    permutations,
+    permuted_correlations,
+    summarize,
+)
+from harness.statistics.families import ALPHA, holm, shares_left
 from harness.statistics.signflips import (
     POWER,
     detectable_difference,
@@ -36,12 +41,15 @@ class Judged(NamedTuple):
     high: np.ndarray
     n: np.ndarray
     p: np.ndarray
+    """as the test gives it, of one side where the test has one"""
     corrected: np.ndarray
-    """p after Holm's correction over the claim's family"""
+    """p after Holm's correction over the claim's family; before it, what is to be corrected"""
+    share: np.ndarray
+    """of the 5%, once the tests of the family that were decided have passed theirs on"""
     word: np.ndarray
     """1 for what the claim says, -1 for its opposite, 0 for undecided"""
     detectable: np.ndarray
-    """the effect that would have been found with 80% power"""
+    """the effect that would have been found with 80% power at that share; NaN for none"""
 
 
 class Comparison(NamedTuple):
@@ -78,12 +86,10 @@ def compare_arms(first: np.ndarray, second: np.ndarray) -> Comparison:
     single = _flipped(differences)
     headline, tasks = _correct(together, single)
 
-    share = 1 / np.maximum((~np.isnan(together.p)).sum(axis=-1), 1)[..., None]
-    headline = headline._replace(
-        detectable=detectable_difference(_deviation(heads), headline.n, share)
-    )
-    share = 1 / np.maximum((~np.isnan(single.p)).sum(axis=(-2, -1)), 1)[..., None, None]
-    tasks = tasks._replace(detectable=detectable_difference(_deviation(differences), counts, share))
+    found = detectable_difference(_deviation(heads), headline.n, headline.share)
+    headline = headline._replace(detectable=found)
+    found = detectable_difference(_deviation(differences), counts, tasks.share)
+    tasks = tasks._replace(detectable=found)
 
     bound = NEGLIGIBLE * _deviation(np.where(present, first, np.nan))
     negligible = (tasks.low >= -bound) & (tasks.high <= bound) & (bound > 0)
@@ -109,7 +115,8 @@ def _flipped(differences: np.ndarray) -> Judged:
         mean = np.nansum(differences, axis=-1) / counts
     low, high = sign_flip_interval(differences)
     p = sign_flip_test(differences)
-    return Judged(mean, low, high, counts, p, p, np.sign(mean), np.full(p.shape, np.nan))
+    none = np.full(p.shape, np.nan)
+    return Judged(mean, low, high, counts, p, p, none, np.sign(mean), none)
 
 
 def _correct(headline: Judged, tasks: Judged) -> tuple[Judged, Judged]:
@@ -119,14 +126,17 @@ def _correct(headline: Judged, tasks: Judged) -> tuple[Judged, Judged]:
         headline: Tests `[..., contrasts]`, whose `word` is the direction found.
         tasks: Tests `[..., contrasts, tasks]`.
     """
-    shape = tasks.p.shape[-2:]
-    single = tasks.p.reshape(*tasks.p.shape[:-2], -1)
-    tests = np.concatenate([headline.p, single], axis=-1)
-    corrected = holm(tests, _weights(headline.p, single))
+    shape = tasks.p.shape
+    single = tasks.corrected.reshape(*shape[:-2], -1)
+    weights = _weights(headline.p, single)
+    corrected = holm(np.concatenate([headline.corrected, single], axis=-1), weights)
+    shares = shares_left(corrected, weights)
 
-    of_headlines = corrected[..., : headline.p.shape[-1]]
-    of_tasks = corrected[..., headline.p.shape[-1] :].reshape(*single.shape[:-1], *shape)
-    return _called(headline, of_headlines), _called(tasks, of_tasks)
+    heads = headline.p.shape[-1]
+    return (
+        _called(headline, corrected[..., :heads], shares[..., :heads]),
+        _called(tasks, corrected[..., heads:].reshape(shape), shares[..., heads:].reshape(shape)),
+    )
 
 
 def _weights(headlines: np.ndarray, tasks: np.ndarray) -> np.ndarray:
@@ -139,9 +149,10 @@ def _weights(headlines: np.ndarray, tasks: np.ndarray) -> np.ndarray:
     return np.concatenate(shares, axis=-1)
 
 
-def _called(judged: Judged, corrected: np.ndarray) -> Judged:
+def _called(judged: Judged, corrected: np.ndarray, share: np.ndarray) -> Judged:
     word = np.where(corrected <= ALPHA, judged.word, 0)
-    return judged._replace(corrected=corrected, word=np.nan_to_num(word).astype(int))
+    word = np.nan_to_num(word).astype(int)
+    return judged._replace(corrected=corrected, share=share, word=word)
 
 
 def _deviation(values: np.ndarray) -> np.ndarray:
@@ -191,23 +202,39 @@ def associate(psi: np.ndarray, score: np.ndarray, tasks: np.ndarray) -> Associat
     sums = np.stack([total for total, _ in found], axis=-2)
     settings = np.stack([count for _, count in found], axis=-1)
 
-    headline, single = _correct(
-        _placed(sums.sum(axis=-2), settings.sum(axis=-1), agents),
-        _placed(sums, settings, agents),
+    together = summarize(sums.sum(axis=-2), settings.sum(axis=-1))
+    each = summarize(sums, settings)
+    headline, single = _correct(_placed(together, agents), _placed(each, agents))
+    return Association(
+        _with_detectable(headline, together.deviation, agents),
+        _with_detectable(single, each.deviation, agents),
     )
-    return Association(headline, single)
 
 
-def _placed(sums: np.ndarray, settings: np.ndarray, agents: int) -> Judged:
-    """A correlation's place among its permutations; low and high are left to the report."""
-    found = summarize(sums, settings)
+def _placed(found: Correlation, agents: int) -> Judged:
+    """A correlation's place among its permutations; low and high are left to the report.
+
+    p is that of the side that is nearer to a word. What is to be corrected is p over the side's
+    share of the level.
+    """
     claimed = found.below / CLAIMED
     opposite = found.above / (1 - CLAIMED)
-    p = np.minimum(np.minimum(claimed, opposite), 1.0)
+    weighted = np.minimum(np.minimum(claimed, opposite), 1.0)
     word = np.where(claimed <= opposite, 1, -1)
+    p = np.where(word == 1, found.below, found.above)
 
-    tests = max(p.shape[-1], 1)
-    reach = stats.norm.ppf(1 - ALPHA * CLAIMED / tests) + stats.norm.ppf(POWER)
     none = np.full(p.shape, np.nan)
-    n = np.where(settings > 0, agents, 0)
-    return Judged(found.mean, none, none, n, p, p, word, reach * found.deviation)
+    n = np.where(np.isnan(p), 0, agents)
+    return Judged(found.mean, none, none, n, p, weighted, none, word, none)
+
+
+def _with_detectable(judged: Judged, deviation: np.ndarray, agents: int) -> Judged:
+    """With the size of the negative correlation that would have been found with 80% power.
+
+    By the normal approximation. None where that is above 1, or where the permutations are too few
+    for a p at the test's level.
+    """
+    level = ALPHA * CLAIMED * judged.share
+    effect = (stats.norm.ppf(1 - level) + stats.norm.ppf(POWER)) * deviation
+    reached = level * len(permutations(agents)) >= 1 - 1e-9
+    return judged._replace(detectable=np.where(reached & (effect <= 1), effect, np.nan))

@@ -208,12 +208,10 @@ def _findings(
     arms: Arms, compared: Comparison, number: int, about: str, words: list[str], verdict: str
 ) -> list[Finding]:
     """A contrast's findings: the headline, each task in two units, and what stands beside."""
-    contrasts = len(arms.contrasts)
-    tests = int((compared.tasks.n > 0).sum())
     failed = arms.failed[number]
     headline = _finding(
         f"{about}: {STANDARD}", "all", compared.headline, (number,), verdict,
-        int(failed.sum()), 1 / contrasts,
+        int(failed.sum()),
     )  # fmt: skip
     raw, standard = [], []
     for task, word in enumerate(words):
@@ -222,7 +220,7 @@ def _findings(
         place = (number, task)
         found = _finding(
             f"{about}: reward", arms.tasks[task], compared.tasks, place, word,
-            int(failed[task]), 1 / tests,
+            int(failed[task]),
         )  # fmt: skip
         raw.append(found)
         standard.append(_in_deviations(found, f"{about}: {STANDARD}", compared, place))
@@ -232,11 +230,10 @@ def _findings(
 
 
 def _finding(
-    about: str, task: str, tests: Judged, place: tuple[int, ...], word: str, failed: int,
-    share: float,
-) -> Finding:  # fmt: skip
+    about: str, task: str, tests: Judged, place: tuple[int, ...], word: str, failed: int
+) -> Finding:
     n = int(tests.n[place])
-    needed = smallest_n(share)
+    needed = smallest_n(float(tests.share[place]))
     return Finding(
         about, task,
         Estimate(*(float(values[place]) for values in (tests.mean, tests.low, tests.high)), n),

@@ -38,9 +38,9 @@ class Finding:
     detectable: float = np.nan
     """the effect that would have been found with 80% power; NaN if n is too small for any"""
     p: float = np.nan
-    """of the test, as it stands"""
+    """raw, as the test gave it: two-sided, but for claim (a), whose p is of the side judged"""
     p_holm: float = np.nan
-    """corrected over the claim's family; the verdict rests on it"""
+    """adjusted over the claim's family; the verdict rests on it. NaN where none is adjusted"""
     without_failed: str = ""
     """the verdict without the failed runs; empty if there are none"""
     note: str = ""

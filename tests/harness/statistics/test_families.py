@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.statistics import holm
+from harness.statistics import ALPHA, holm
+from harness.statistics.families import shares_left
 
 
 def test_equal_weights_by_hand():
@@ -48,3 +49,22 @@ def test_families_do_not_mix():
 def test_a_family_of_nulls_is_rejected_in_one_case_of_twenty(weights):
     p = np.random.default_rng(2).random((20_000, 4))
     assert (holm(p, weights) <= 0.05).any(axis=1).mean() == pytest.approx(0.05, abs=0.005)
+
+
+def test_decided_tests_pass_their_share_on():
+    """Weights 4, 4, 1, 1 of 10; the first test is decided, and the last was not made."""
+    weights = np.array([0.4, 0.4, 0.1, 0.1])
+    none = shares_left(np.array([0.3, 0.3, 0.3, 0.3]), weights)
+    np.testing.assert_allclose(none, weights)
+    found = shares_left(np.array([0.01, 0.3, 0.3, np.nan]), weights)
+    np.testing.assert_allclose(found, [4 / 9, 4 / 5, 1 / 5, np.nan])
+    np.testing.assert_allclose(shares_left(np.full(4, ALPHA), weights), 1.0)
+
+
+def test_a_test_is_called_by_holm_where_it_is_within_its_share():
+    rng = np.random.default_rng(5)
+    weights = rng.random((500, 6))
+    p = rng.random((500, 6)) ** 3 / 10
+    corrected = holm(p, weights)
+    called = p <= ALPHA * shares_left(corrected, weights)
+    np.testing.assert_array_equal(called, corrected <= ALPHA)

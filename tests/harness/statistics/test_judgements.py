@@ -154,8 +154,10 @@ def test_the_test_is_one_sided_but_for_a_fifth():
     score = np.arange(4.0)[None]
     falling = associate(np.stack([-score, -score]), score, np.array([0]))
     rising = associate(np.stack([score, score]), score, np.array([0]))
-    assert falling.headline.p == pytest.approx([1 / 24 / 0.8] * 2)
-    assert rising.headline.p == pytest.approx([1 / 24 / 0.2] * 2)
+    for found, part in ((falling, 0.8), (rising, 0.2)):
+        assert found.headline.p == pytest.approx([1 / 24] * 2)  # as the test gave it
+        # each of two headlines has 0.4 of the level, and its side a part of that
+        assert found.headline.corrected == pytest.approx([1 / 24 / part / 0.4] * 2)
 
 
 def test_what_could_have_been_found_is_a_correlation():
@@ -168,20 +170,20 @@ def test_what_could_have_been_found_is_a_correlation():
 
 
 def test_what_could_have_been_found_has_its_share_of_the_level():
-    """Two contrasts of three tasks: a headline has half of the level, a task a sixth."""
+    """A headline has 2/5 of the level, half of their 4/5; a task of five 1/25."""
     first, second = PAIRS.copy()
     second[1, 2] = np.nan  # so that five tasks have a test
     found = compare_arms(first, second)
     for contrast in range(2):
         for task in range(2):
             spread = (second - first)[contrast, task].std(ddof=1)
-            expected = detectable_difference(spread, 10, 1 / 5)
+            expected = detectable_difference(spread, 10, 1 / 25)
             assert found.tasks.detectable[contrast, task] == pytest.approx(expected)
     assert np.isnan(found.tasks.detectable[1, 2])
     # all agents have all tasks: each has its mean over the tasks
     for contrast, tasks in ((0, 3), (1, 2)):
         spread = found.standard[contrast, :tasks].mean(axis=0).std(ddof=1)
-        expected = detectable_difference(spread, 10, 1 / 2)
+        expected = detectable_difference(spread, 10, 2 / 5)
         assert found.headline.detectable[contrast] == pytest.approx(expected)
 
 
@@ -201,7 +203,41 @@ def test_a_correlation_is_of_all_its_agents_and_settings_that_are_flat_have_none
     assert found.tasks.n.tolist() == [[9, 0], [9, 0]]
     assert np.isnan(found.tasks.p).tolist() == [[False, True], [False, True]]
     assert found.headline.mean == pytest.approx([1.0, 1.0])
-    # one test is left beside the headlines: 4 tasks share the level, 2 of them not made
-    share = 0.05 * 0.8 / 2
-    reach = stats.norm.ppf(1 - share) + stats.norm.ppf(0.8)
+    # every other test of the family is decided, so each has the whole level
+    assert found.tasks.share[:, 0].tolist() == [1.0, 1.0]
+    assert np.isnan(found.tasks.share[:, 1]).all()
+    reach = stats.norm.ppf(1 - 0.05 * 0.8) + stats.norm.ppf(0.8)
     assert found.tasks.detectable[:, 0] == pytest.approx([reach / np.sqrt(8)] * 2, rel=0.05)
+
+
+def test_a_task_of_sixteen_has_an_eightieth_until_headlines_are_decided():
+    """Ten pairs that all agree have p = 2 / 1024, above 5% / 80 and below 5% / 16."""
+    rng = np.random.default_rng(9)
+    first = rng.normal(size=(2, 8, 10))
+    noise = first + rng.normal(size=(2, 8, 10))
+    undecided = compare_arms(first, noise)
+    assert not undecided.headline.word.any()
+    np.testing.assert_allclose(undecided.tasks.share, 1 / 80)
+    assert np.isnan(undecided.tasks.detectable).all()
+
+    decided = compare_arms(first, noise + np.where(np.arange(8) > 0, 1.5, 0.0)[:, None])
+    assert decided.headline.word.all()
+    assert (decided.tasks.share > 1 / 80).all()
+    assert np.isfinite(decided.tasks.detectable).all()
+
+
+def test_no_correlation_above_1_could_have_been_found():
+    """Five agents, one setting: (z(1 - 0.016) + z(0.8)) / sqrt(4) = 1.49."""
+    rng = np.random.default_rng(10)
+    few = associate(rng.normal(size=(2, 1, 5)), rng.normal(size=(1, 5)), np.array([0]))
+    assert np.isnan(few.headline.detectable).all()
+    assert np.isnan(few.tasks.detectable).all()
+    many = associate(rng.normal(size=(2, 9, 5)), rng.normal(size=(9, 5)), np.repeat(0, 9))
+    assert (many.headline.detectable < 1).all()
+
+
+def test_a_p_that_no_permutation_reaches_could_have_found_nothing():
+    """Three agents have 6 permutations: no p is below 1/6, however many settings there are."""
+    rng = np.random.default_rng(11)
+    found = associate(rng.normal(size=(2, 40, 3)), rng.normal(size=(40, 3)), np.repeat(0, 40))
+    assert np.isnan(found.headline.detectable).all()

@@ -219,15 +219,15 @@ def test_one_deviation_is_found_by_the_headline_of_ten_agents():
     power(10, 0.5)  # printed: what ten agents can and cannot tell
 
 
-@pytest.mark.parametrize("n", [10, 30])
+@pytest.mark.parametrize("n", [12, 30])
 def test_what_could_have_been_found_is_found_four_times_in_five(n):
-    """An effect of the size that a task's finding states, at Holm's first step over 16 tasks."""
+    """An effect of the size that a task's finding states, one of 16 where no test is decided."""
     rng = np.random.default_rng(n)
     arms = scores(rng, normal, 1000, 8, 4, n)
     first, second, _, _ = contrasts(arms)
-    stated = compare_arms(first, second).tasks.detectable.mean(axis=0)[..., None]
+    stated = np.median(compare_arms(first, second).tasks.detectable, axis=0)[..., None]
     found = compare_arms(first, second + stated)
-    rate = (found.tasks.p <= ALPHA / 16).mean()
+    rate = (found.tasks.p <= ALPHA / 5 / 16).mean()
     print(f"n = {n}: an effect of the stated size is found in {rate:.0%}")
     assert 0.7 < rate < 0.9
 
@@ -237,8 +237,8 @@ def test_a_headline_finds_what_it_states_four_times_in_five(n):
     rng = np.random.default_rng(n)
     deviation = 10.0 ** np.linspace(0, 3, 8)[:, None]
     first, second, _, _ = contrasts(scores(rng, normal, 1000, 8, 4, n))
-    stated = compare_arms(first, second).headline.detectable.mean()
+    stated = np.median(compare_arms(first, second).headline.detectable)
     found = compare_arms(first, second + stated * deviation)
-    rate = (found.headline.p <= ALPHA / 2).mean()
+    rate = (found.headline.p <= ALPHA * 4 / 5 / 2).mean()
     print(f"n = {n}: a headline of the stated size is found in {rate:.0%}")
     assert 0.7 < rate < 0.9

@@ -287,7 +287,8 @@ def test_one_pair_is_undecided_and_says_what_it_takes(study):
     results = study(lambda *key: None if key[2] else 1.0 * len(key[1]), agents=2, tasks=TASKS)
     claim = claim_of(results)
     assert claim.verdict == "undecided"
-    assert found(claim, "reward", "Ant").note == "7 pairs could decide"
+    # a task of three has 5% / 5 / 3, which 2 / 2^10 is below
+    assert found(claim, "reward", "Ant").note == "10 pairs could decide"
     assert np.isnan(found(claim, "reward", "Ant").detectable)
 
 
@@ -320,7 +321,24 @@ def test_two_contrasts_take_a_pair_more_than_one(study):
     results = study(shifted({"Hopper": UP}), algorithms=FOUR, agents=6)
     for contrast in ("PPO reg - PPO", "TRPO reg - TRPO"):
         assert headline(claim_of(results), contrast).note == "7 pairs could decide"
-        assert found(claim_of(results), f"{contrast}: reward", "Hopper").note.startswith("7 pairs")
+        # one of two tasks has 5% / 5 / 2, which 2 / 2^9 is below
+        task = found(claim_of(results), f"{contrast}: reward", "Hopper")
+        assert task.note == "9 pairs could decide"
+
+
+def test_twelve_pairs_could_decide_one_of_sixteen_tasks(study):
+    """5% / 5 / 16 = 0.000625 is above 2 / 2^12, and below 2 / 2^11."""
+    tasks = tuple("ABCDEFGH")
+    results = study(
+        lambda _, name, agent: agent + 3.0 * SIGNS[agent] * (name in ("PPO reg", "TRPO reg")),
+        algorithms=FOUR, tasks=tasks,
+    )  # fmt: skip
+    claim = claim_of(results)
+    assert claim.verdict == "undecided"
+    for task in tasks:
+        finding = found(claim, "TRPO reg - TRPO: reward", task)
+        assert finding.note == "12 pairs could decide"
+        assert np.isnan(finding.detectable)
 
 
 PLANNED = {(task, name) for task in TASKS for name in ("PPO", "PPO reg")}

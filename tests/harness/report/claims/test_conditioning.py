@@ -63,7 +63,18 @@ def test_it_is_undecided_where_psi_has_nothing_to_do_with_reward(study):
     assert finding.estimate.mean == pytest.approx(stats.spearmanr(range(10), order).statistic)
     assert finding.verdict == "undecided"
     assert claim_of(results).verdict == "undecided"
-    assert 0.5 < finding.detectable < 1.1
+    assert finding.p == pytest.approx(0.47, abs=0.02)  # as the test gave it: SciPy's
+
+
+def test_what_could_have_been_found_is_a_correlation_of_at_most_1(study):
+    """A headline of two has 2/5 of the level, four fifths of it on one side."""
+    reach = stats.norm.ppf(1 - 0.05 * 2 / 5 * 4 / 5) + stats.norm.ppf(0.8)
+    order = np.random.default_rng(0).permutation(20)
+    results = study(learns, lambda *key: order[key[2]] + RISING, algorithms=["PPO"], agents=20)
+    finding = found(claim_of(results), "final psi")
+    assert finding.detectable == pytest.approx(reach / np.sqrt(19), rel=0.05)
+    few = study(learns, lambda *key: order[key[2]] + RISING, algorithms=["PPO"], agents=6)
+    assert np.isnan(found(claim_of(few), "final psi").detectable)  # 1.34 is none
 
 
 def test_early_psi_is_not_late_psi(study):
