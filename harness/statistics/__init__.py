@@ -6,7 +6,7 @@ data sets at once: see tests/harness/statistics/test_simulation.py.
 
 from harness.statistics.aggregates import interquartile_mean, probability_of_improvement
 from harness.statistics.correlation import permuted_correlations, rank_correlation, spearman
-from harness.statistics.families import ALPHA, holm
+from harness.statistics.families import ALPHA, holm, shares_left
 from harness.statistics.intervals import (
     Estimate,
     estimate_mean,
@@ -54,6 +54,7 @@ __all__ = [
     "permuted_correlations",
     "probability_of_improvement",
     "rank_correlation",
+    "shares_left",
     "sign_flip_interval",
     "sign_flip_test",
     "smallest_n",

@@ -63,6 +63,8 @@ class Comparison(NamedTuple):
     """`[..., contrasts, tasks]`: the interval is within half of the first arm's deviation"""
     standard: np.ndarray
     """`[..., contrasts, tasks, n]`: differences in standard deviations"""
+    deviation: np.ndarray
+    """`[..., contrasts, tasks]`: of both arms together; 1 where all scores are equal"""
 
 
 def compare_arms(first: np.ndarray, second: np.ndarray) -> Comparison:
@@ -79,7 +81,8 @@ def compare_arms(first: np.ndarray, second: np.ndarray) -> Comparison:
     differences = second - first
     present = ~np.isnan(differences)
     counts = present.sum(axis=-1)
-    standard = differences / _deviation_of_both(first, second, present)[..., None]
+    deviation = _deviation_of_both(first, second, present)
+    standard = differences / deviation[..., None]
 
     heads = _over_tasks(standard, counts)
     together = _flipped(heads)
@@ -93,7 +96,7 @@ def compare_arms(first: np.ndarray, second: np.ndarray) -> Comparison:
 
     bound = NEGLIGIBLE * _deviation(np.where(present, first, np.nan))
     negligible = (tasks.low >= -bound) & (tasks.high <= bound) & (bound > 0)
-    return Comparison(headline, tasks, negligible, standard)
+    return Comparison(headline, tasks, negligible, standard, deviation)
 
 
 def _over_tasks(standard: np.ndarray, counts: np.ndarray) -> np.ndarray:

@@ -131,7 +131,7 @@ def _rows(differences: np.ndarray) -> tuple[np.ndarray, tuple[int, ...]]:
 
 
 def _by_pairs(rows: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Rows with equally many pairs, a chunk at a time: their places, and their pairs `[rows, k]`."""
+    """Rows with equally many pairs, a chunk at a time: their places, and pairs `[rows, k]`."""
     present = ~np.isnan(rows)
     counts = present.sum(axis=1)
     for count in np.unique(counts[counts > 0]):

@@ -9,6 +9,10 @@ s_e^2 that of what is left, which holds the repeats' noise:
 This is what resampling runs, then levels, comes to as the resamples grow many (Owen, 2007), without
 its noise, with n - 1 where resampling has n, and without the repeats' noise counted a second time:
 a level brings its repeats with it. The interval is Student's with n - 1 degrees of freedom.
+
+Where neither runs nor levels differ, that variance is 0, and Student's p would be 0 too, however
+few the runs. What n equal gains show is that n signs agree, so the sign-flip test has the say
+there: its p is 2 / 2^n, and 5 runs have no interval.
 """
 
 from __future__ import annotations
@@ -21,9 +25,15 @@ from scipy import stats
 
 from harness.statistics.families import ALPHA
 from harness.statistics.intervals import Estimate
-from harness.statistics.signflips import POWER
+from harness.statistics.signflips import (
+    POWER,
+    detectable_difference,
+    sign_flip_interval,
+    sign_flip_test,
+)
 
 MIN_TRAINING_RUNS = 5  # below, an interval says how the rate varies over levels and no more
+FLAT = 1e-9  # a standard error up to which rates differ by rounding only
 
 
 class Success(NamedTuple):
@@ -70,15 +80,28 @@ def compare_success(rates: np.ndarray, share: float = 1.0) -> Success:
 
     error = np.sqrt(variance)
     reach = stats.t.ppf(1 - ALPHA / 2, max(degrees, 1)) * error
-    p = np.full(mean.shape, np.nan)
-    detectable = np.full(mean.shape, np.nan)
-    if runs >= MIN_TRAINING_RUNS:
-        with np.errstate(invalid="ignore", divide="ignore"):
-            p = 2 * stats.t.sf(np.abs(mean) / error, degrees)
-        p = np.where(mean == 0, 1.0, p)
-        needed = stats.t.ppf(1 - ALPHA * share / 2, degrees) + stats.t.ppf(POWER, degrees)
-        detectable = error * needed
-    return Success(mean, mean - reach, mean + reach, p, detectable)
+    none = np.full(mean.shape, np.nan)
+    found = Success(mean, mean - reach, mean + reach, none, none)
+    if runs < MIN_TRAINING_RUNS:
+        return found
+
+    flat = error <= FLAT
+    p = 2 * stats.t.sf(np.abs(mean) / np.where(flat, 1.0, error), degrees)
+    needed = stats.t.ppf(1 - ALPHA * share / 2, degrees) + stats.t.ppf(POWER, degrees)
+    found = found._replace(p=p, detectable=error * needed)
+    return _with_flat(found, flat, of_runs, share) if flat.any() else found
+
+
+def _with_flat(found: Success, flat: np.ndarray, of_runs: np.ndarray, share: float) -> Success:
+    """With the sign-flip test's numbers where rates differ by rounding only."""
+    values = np.where(np.abs(of_runs) <= FLAT, 0.0, of_runs)
+    low, high = sign_flip_interval(values)
+    p = sign_flip_test(values)
+    detectable = detectable_difference(np.zeros(p.shape), np.array(values.shape[-1]), share)
+    replaced = {"low": low, "high": high, "p": p, "detectable": detectable}
+    return found._replace(
+        **{name: np.where(flat, new, getattr(found, name)) for name, new in replaced.items()}
+    )
 
 
 def estimate_success(agents: list[np.ndarray]) -> Estimate:

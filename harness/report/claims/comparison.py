@@ -71,21 +71,16 @@ def comparison_claim(agents: pd.DataFrame, letter: str, planned: set[tuple[str, 
     """
     named = {name for contrast in CONTRASTS[letter] for name in contrast}
     compared = agents[agents["algorithm"].isin(named)]
-    part = judge(compared, letter, planned, "reward")
     failed = int(compared["failed"].sum())
-    without = ""
-    if failed and part.findings:
-        kept = judge(compared[~compared["failed"]], letter, planned, "reward")
-        part = part._replace(findings=with_kept(part.findings, kept.findings))
-        without = agreed(kept.verdicts)
-
+    part, without = _with_and_without(compared, letter, planned, "reward")
     findings = list(part.findings)
     notes = list(part.notes)
     if part.findings and compared["final"].notna().any():
-        final = judge(compared, letter, planned, "final")
+        final, kept = _with_and_without(compared, letter, planned, "final")
         findings += final.findings
         notes += final.notes
-        notes.append(f"By the final policies: {agreed(final.verdicts)}.")
+        beside = f"; without the failed runs: {kept}" if kept else ""
+        notes.append(f"By the final policies: {agreed(final.verdicts)}{beside}.")
 
     steps = compared.loc[~compared["failed"], "steps"]
     return Claim(
@@ -93,6 +88,17 @@ def comparison_claim(agents: pd.DataFrame, letter: str, planned: set[tuple[str, 
         basis=basis_of(steps, paper_numbers("table1")["timesteps"]),
         failed=failed, without_failed=without, notes=tuple(notes),
     )  # fmt: skip
+
+
+def _with_and_without(
+    compared: pd.DataFrame, letter: str, planned: set[tuple[str, str]], column: str
+) -> tuple[Part, str]:
+    """What an outcome says, and its verdict without the failed runs; empty if there are none."""
+    part = judge(compared, letter, planned, column)
+    if not part.findings or not compared["failed"].any():
+        return part, ""
+    kept = judge(compared[~compared["failed"]], letter, planned, column)
+    return part._replace(findings=with_kept(part.findings, kept.findings)), agreed(kept.verdicts)
 
 
 def judge(agents: pd.DataFrame, letter: str, planned: set[tuple[str, str]], column: str) -> Part:
@@ -249,11 +255,9 @@ def _in_deviations(
     found: Finding, about: str, compared: Comparison, place: tuple[int, ...]
 ) -> Finding:
     """The same finding in standard deviations, so that tasks can be drawn beside each other."""
-    mean = float(np.nanmean(compared.standard[place]))
-    unit = found.estimate.mean / mean if mean else np.nan
-    estimate = Estimate(
-        mean, found.estimate.low / unit, found.estimate.high / unit, found.estimate.n
-    )
+    unit = float(compared.deviation[place])
+    mean, low, high, n = found.estimate
+    estimate = Estimate(mean / unit, low / unit, high / unit, n)
     return Finding(
         about, found.task, estimate, found.verdict, found.failed, found.detectable / unit, found.p,
         found.p_holm, note=found.note,

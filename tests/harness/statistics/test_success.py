@@ -124,8 +124,33 @@ def test_what_could_have_been_found_by_hand():
 
 
 def test_no_difference_is_none():
-    found = compare_success(np.zeros((5, 4)))
+    found = compare_success(np.zeros((6, 4)))
     assert (found.mean, found.low, found.high, found.p) == (0, 0, 0, 1)
+
+
+@pytest.mark.parametrize("gain", [0.25, -0.1 * 3])
+def test_equal_gains_are_as_many_signs_that_agree(gain):
+    """Nothing varies, so Student's p would be 0: the sign-flip test's is 2 / 2^n."""
+    five = compare_success(np.full((5, 4), gain))
+    assert (five.mean, five.p) == (pytest.approx(gain), 2 / 32)
+    assert np.isnan([five.low, five.high, five.detectable]).all()
+    ten = compare_success(np.full((10, 4), gain), share=1 / 8)
+    assert ten.p == 2 / 1024
+    assert (ten.low, ten.high, ten.detectable) == pytest.approx((gain, gain, 0.0))
+
+
+def test_rounding_is_no_gain():
+    noise = 1e-17 * np.array([1.0, -1.0, 3.0, 1.0, 2.0, 1.0])
+    found = compare_success(np.repeat(noise[:, None], 3, axis=1))
+    assert found.p == 1.0
+
+
+def test_only_data_sets_that_do_not_vary_are_flipped():
+    varied = np.random.default_rng(4).normal(0.3, size=(6, 4))
+    both = compare_success(np.stack([varied, np.full((6, 4), 0.3)]))
+    alone = compare_success(varied)
+    np.testing.assert_allclose([values[0] for values in both], alone)
+    assert both.p[1] == 2 / 64
 
 
 def test_one_level_has_no_interval_over_levels():

@@ -271,6 +271,31 @@ def test_final_policies_stand_beside_and_do_not_move_the_verdict(study):
     assert headline(claim).p_holm == headline(claim_of(study(shifted({"Hopper": UP})))).p_holm
 
 
+def test_final_policies_are_also_judged_without_the_failed_runs(study):
+    """Half of the regularized agents fail; the final policies of the others win."""
+
+    def score(_task, name, agent):
+        return 5.0 * agent + (50.0 + agent) * (name == "PPO reg")
+
+    results = study(
+        score, final=score, agents=20,
+        diverged=lambda _, name, agent: name == "PPO reg" and agent % 2 == 0,
+    )  # fmt: skip
+    claim = claim_of(results)
+    finding = found(claim, "final policies, PPO reg - PPO: reward", "Hopper")
+    assert (finding.verdict, finding.without_failed) == ("undecided", "win")
+    note = "By the final policies: undecided; without the failed runs: supported."
+    assert note in claim.notes
+
+
+def test_no_difference_has_an_interval_in_deviations_too(study):
+    claim = claim_of(study(lambda _, name, agent: 10.0 * agent + SIGNS[agent] * (len(name) > 3)))
+    finding = found(claim, "PPO reg - PPO: in standard deviations", "Hopper")
+    assert finding.estimate.mean == 0.0
+    assert finding.estimate.low == pytest.approx(-finding.estimate.high)
+    assert finding.estimate.high > 0
+
+
 # --- how much it takes ----------------------------------------------------------------------------
 
 

@@ -28,8 +28,11 @@ def both_levels(rate: int) -> list[list[int]]:
     return [[1] * rate + [0] * (4 - rate)] * 4
 
 
-def claim_of(store, reg, seeds=10, plain=lambda _: 1, leave_out=()):
-    """Agents win `plain(seed)` of 4 repeats on each level, and `reg(seed)` with the penalty."""
+def claim_of(store, reg, seeds=10, plain=lambda _: 1, leave_out=(), lost=lambda *_: False):
+    """Agents win `plain(seed)` of 4 repeats on each level, and `reg(seed)` with the penalty.
+
+    Those that `lost(algorithm, seed)` names have failed, and were evaluated all the same.
+    """
     suite = load_suite("table2", seeds=seeds)
     for run in suite.runs:
         seed = run.args["seed"]
@@ -37,7 +40,10 @@ def claim_of(store, reg, seeds=10, plain=lambda _: 1, leave_out=()):
             continue
         rates = reg(seed) if run.algorithm.endswith(" reg") else plain(seed)
         seen, unseen = rates if isinstance(rates, tuple) else (rates, rates)
-        write_run(store, run, [0.0], episodes=episodes(both_levels(seen), both_levels(unseen)))
+        write_run(
+            store, run, [0.0], episodes=episodes(both_levels(seen), both_levels(unseen)),
+            diverged=lost(run.algorithm, seed),
+        )  # fmt: skip
     return generalization_claim(load_results(suite, store))
 
 
@@ -88,7 +94,14 @@ def test_below_five_training_runs_the_verdict_says_how_many(store, seeds, word):
 
 
 def test_five_training_runs_have_a_verdict(store):
-    assert claim_of(store, lambda _: 4, seeds=5).verdict == "supported"
+    assert claim_of(store, lambda seed: 3 + seed % 2, seeds=5).verdict == "supported"
+
+
+def test_five_equal_gains_decide_nothing(store):
+    """Five signs agree, which has a chance of 2 / 32."""
+    claim = claim_of(store, lambda _: 4, seeds=5)
+    assert claim.verdict == "undecided"
+    assert {f.p for f in claim.findings} == {2 / 32}
 
 
 def test_the_pair_with_the_fewest_runs_speaks_for_all(store):
@@ -145,12 +158,13 @@ def test_the_basis_is_the_papers_fifty_million_steps(store):
 
 
 def test_a_finding_is_the_test_of_its_column(store):
-    """Each of eight columns has an eighth of the level."""
+    """Seen levels are decided; four unseen columns share the level that they pass on."""
     claim = claim_of(store, lambda seed: (gain(seed), seed % 3), seeds=6)
     wins = np.arange(1, 7)
-    for finding, reg in zip(claim.findings[:2], (2 + wins % 2, wins % 3), strict=True):
+    won = ((2 + wins % 2, 1 / 5), (wins % 3, 1 / 4))
+    for finding, (reg, share) in zip(claim.findings[:2], won, strict=True):
         gains = np.repeat((reg - 1)[:, None] / 4, 4, axis=1)
-        expected = compare_success(gains, share=1 / 8)
+        expected = compare_success(gains, share)
         assert finding.estimate == pytest.approx((*(float(x) for x in expected[:3]), 6))
         assert finding.p == pytest.approx(float(expected.p))
         assert finding.detectable == pytest.approx(float(expected.detectable))
@@ -179,6 +193,57 @@ def test_failures_are_counted_for_each_pair_of_agents(store):
     expected = {"PPO": 3, "PPO-l2": 0, "PPO-D": 0, "PPO-IMP": 1}
     assert failed == {task: expected[task] for task in failed}
     assert {"PPO-l2", "PPO-IMP"} <= set(failed)
+
+
+def test_a_failed_run_has_the_rates_of_the_worst_single_run(store):
+    """The worst run of all is a plain one of seed 7 with no success; PPO reg fails with seed 3.
+
+    In quarters: 3 - 1 for seeds 1, 5 and 9, 3 - 0 for 7, 2 - 1 for even ones, and 0 - 1 for 3.
+    """
+    claim = claim_of(
+        store, gain, plain=lambda seed: 0 if seed == 7 else 1,
+        lost=lambda name, seed: (name, seed) == ("PPO reg", 3),
+    )  # fmt: skip
+    first, second = claim.findings[0], claim.findings[2]
+    assert first.estimate.mean == pytest.approx((3 * 2 + 3 + 5 - 1) / 10 / 4)
+    assert second.estimate.mean == pytest.approx((4 * 2 + 3 + 5) / 10 / 4)  # PPO-l2's are whole
+    assert [(f.failed, f.estimate.n) for f in (first, second)] == [(1, 10), (0, 10)]
+    assert claim.failed == 1
+
+
+def test_a_failed_run_that_was_not_evaluated_counts_too(store):
+    suite = load_suite("table2", seeds=2)
+    for run in suite.runs:
+        lost = (run.algorithm, run.args["seed"]) == ("PPO", 2)
+        found = None if lost else episodes(BETTER, BETTER)
+        write_run(store, run, [0.0], episodes=found, diverged=lost)
+    claim = generalization_claim(load_results(suite, store))
+    assert (claim.findings[0].estimate.n, claim.findings[0].estimate.mean) == (2, 0.0)
+    assert claim.failed == 1
+
+
+def test_every_verdict_is_also_given_without_the_failed_runs(store):
+    """The regularized agents win wherever they do not fail, and half of them fail."""
+    claim = claim_of(
+        store, lambda seed: 2 + seed % 4 // 2,
+        lost=lambda name, seed: name.endswith(" reg") and seed % 2 == 1,
+    )  # fmt: skip
+    assert (claim.verdict, claim.without_failed) == ("undecided", "supported")
+    assert {f.without_failed for f in claim.findings} == {"supported"}
+    assert claim.failed == 4 * 5
+
+
+def test_without_failures_there_is_no_second_verdict(store):
+    claim = claim_of(store, gain)
+    assert (claim.failed, claim.without_failed) == (0, "")
+    assert {f.without_failed for f in claim.findings} == {""}
+
+
+def test_runs_that_all_failed_are_equal(store):
+    claim = claim_of(store, gain, seeds=6, lost=lambda *_: True)
+    assert claim.verdict == "undecided"
+    assert {(f.estimate.mean, f.p, f.failed) for f in claim.findings} == {(0.0, 1.0, 12)}
+    assert {f.without_failed for f in claim.findings} == {"undecided"}
 
 
 def test_agents_of_two_games_are_apart(store, tmp_path):
