@@ -2,6 +2,7 @@
 
 Runs of a suite that ran side by side, or on different days, share their machine unequally. Here one
 run of each arm follows the other, the arms change who goes first, and each repetition is a pair.
+Each says by which commit, on which machine and when it was measured.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from harness.provenance import ROOT
+from harness.provenance import ROOT, commit_of, here, machine_of, now
 from harness.suite import SuiteError
 
 ALGORITHMS = {"PPO": "ppo_reg", "TRPO": "trpo_reg"}
@@ -25,11 +26,12 @@ IMPLEMENTATIONS = {
     "population": ("_population", ["--num-agents", "10"]),
 }
 ARMS = {"plain": ["--coefficient", "0.0"], "reg": []}
-COLUMNS = ["algorithm", "implementation", "environment", "repetition", "plain", "reg"]
+ORIGIN = ["commit", "machine", "date"]
+COLUMNS = ["algorithm", "implementation", "environment", "repetition", "plain", "reg", *ORIGIN]
 
 
 class CostError(RuntimeError):
-    """A run that was to be timed and failed, and its log's end."""
+    """A run that was to be timed and failed, with its log's end; or a cost.csv that is too old."""
 
 
 def measure_in_turn(
@@ -54,16 +56,33 @@ def measure_in_turn(
     rows = []
     for repetition in range(repetitions):
         for algorithm, implementation, name in _kinds(environments, implementations):
+            origin = _origin()
             order = list(ARMS) if repetition % 2 == 0 else list(ARMS)[::-1]
             times = {
                 arm: _seconds(algorithm, implementation, environments[name], arm, updates)
                 for arm in order
             }
             row = [algorithm, implementation, name, repetition, times["plain"], times["reg"]]
-            rows.append(row)
+            rows.append([*row, *origin])
             added = times["reg"] / times["plain"] - 1
             say(f"{algorithm}, {implementation}, {name}, {repetition}: {100 * added:+.1f}%")
     return pd.DataFrame(rows, columns=COLUMNS)
+
+
+def check_timed(timed: pd.DataFrame) -> None:
+    """Refuse measurements that don't say what they come from."""
+    missing = [name for name in ORIGIN if name not in timed]
+    if missing:
+        raise CostError(
+            f"cost.csv has no {', '.join(missing)}: an earlier version measured it, and nothing "
+            "says where. Measure again with python -m harness cost, or delete it"
+        )
+
+
+def _origin() -> list[str]:
+    """The commit, the machine and the date, as they are now."""
+    found = here()
+    return [commit_of(found), machine_of({**found, "device": "cpu"}), now()]
 
 
 def _kinds(environments: dict[str, str], implementations: list[str]) -> list[tuple[str, str, str]]:

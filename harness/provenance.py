@@ -103,7 +103,7 @@ def find_origins(specs: Iterable[dict[str, Any]]) -> Origins:
     runs = [spec.get("sessions", []) for spec in specs]
     packages = {name: None for sessions in runs for x in sessions for name in x["versions"]}
     origins = Origins(
-        commits=_count([[_commit(x) for x in sessions] for sessions in runs]),
+        commits=_count([[commit_of(x) for x in sessions] for sessions in runs]),
         versions={
             name: _count([[x["versions"].get(name, "none") for x in sessions] for sessions in runs])
             for name in packages
@@ -133,7 +133,7 @@ def _warnings(origins: Origins, runs: list[list[dict[str, Any]]]) -> list[str]:
             parts = ", ".join(f"{name} ({n})" for name, n in counts.items())
             found.append(f"The runs mix {what}: {parts}.")
 
-    commits = [{_commit(x) for x in sessions} for sessions in runs]
+    commits = [{commit_of(x) for x in sessions} for sessions in runs]
     if continued := sum(len(of) > 1 for of in commits):
         found.append(f"{continued} runs were continued by another commit than began them.")
     return found
@@ -148,7 +148,8 @@ def _count(names: list[list[str]]) -> dict[str, int]:
     return dict(sorted(counts.items(), key=lambda item: -item[1]))
 
 
-def _commit(session: dict[str, Any]) -> str:
+def commit_of(session: dict[str, Any]) -> str:
+    """Abbreviated; with a plus where files of the code had changed since."""
     return session["commit"][:10] + ("+" if session["clean"] is False else "")
 
 

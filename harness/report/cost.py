@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
+from harness.cost import check_timed
 from harness.provenance import last_session, machine_of
 from harness.report.claims.finding import (
     CONTRADICTED,
@@ -33,11 +34,18 @@ def cost_claim(results: Results) -> Claim:
 
     Where `python -m harness cost` has measured both arms in turn, the verdict is of that. Else it
     is of the suite's own runs, which must have shared their machine alike to mean anything.
+
+    Raises:
+        CostError: The measurement does not say what it comes from.
     """
+    if results.timed is not None:
+        check_timed(results.timed)
     findings = from_runs(results) if results.timed is None else measured_in_turn(results.timed)
     how = "the suite's own runs" if results.timed is None else "both arms in turn, alone"
     named = list(dict.fromkeys(finding.about.rpartition(", ")[2] for finding in findings))
-    notes = (f"Implementations: {', '.join(named)}. Measured on {how}.",) if named else ()
+    notes = [f"Implementations: {', '.join(named)}. Measured on {how}."] if named else []
+    if named and results.timed is not None:
+        notes += measured_by(results.timed, results)
     steps = [
         results.scores[run.run_id]["steps"]
         for run in results.suite.runs
@@ -45,7 +53,35 @@ def cost_claim(results: Results) -> Claim:
     ]
     verdict = agreed([finding.verdict for finding in findings]) if findings else UNDECIDED
     basis = basis_of(steps, paper_numbers("table1")["timesteps"])
-    return Claim("e", STATEMENT, verdict, findings, basis, notes=notes)
+    return Claim("e", STATEMENT, verdict, findings, basis, notes=tuple(notes))
+
+
+def measured_by(timed: pd.DataFrame, results: Results) -> list[str]:
+    """What a measurement comes from, and what else the suite's own runs come from."""
+    days = sorted({str(date)[:10] for date in timed["date"]})
+    span = " to ".join(dict.fromkeys((days[0], days[-1])))
+    commits = list(timed["commit"].unique())
+    machines = list(timed["machine"].unique())
+    lines = [f"Commit {', '.join(commits)}; {', '.join(machines)}; {span}."]
+
+    own = results.origins
+    for what, measured, made in (
+        ("commit", commits, own.commits), ("machine", machines, own.machines)
+    ):  # fmt: skip
+        if made and not set(measured) & set(made):
+            lines.append(f"The suite's own runs are of another {what}: {', '.join(made)}.")
+    return lines
+
+
+def mixed_measurements(timed: pd.DataFrame | None) -> list[str]:
+    """A warning where the measurements of `python -m harness cost` come from several places."""
+    found = []
+    for column in ("commit", "machine") if timed is not None else ():
+        counts = timed[column].value_counts()
+        if len(counts) > 1:
+            parts = ", ".join(f"{name} ({n})" for name, n in counts.items())
+            found.append(f"The measurements of claim (e) mix {column}s: {parts}.")
+    return found
 
 
 def measured_in_turn(timed: pd.DataFrame) -> list[Finding]:

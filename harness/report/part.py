@@ -9,7 +9,7 @@ from rich.table import Table
 
 from harness.provenance import Origins
 from harness.report import claims
-from harness.report.cost import cost_claim
+from harness.report.cost import cost_claim, mixed_measurements
 from harness.report.figures.arms import draw_arms, sweep
 from harness.report.figures.claims import findings, psi_and_reward
 from harness.report.figures.curves import CONDITIONING, LEARNING, draw_measures
@@ -61,7 +61,10 @@ class Part:
         """What cannot be read, and what mixes: control tasks and CoinRun by themselves."""
         parts = [self.results.part(evaluated) for evaluated in (False, True)]
         mixing = [warning for part in parts for warning in part.origins.warnings]
-        return list(dict.fromkeys([*self.results.warnings, *mixing]))
+        found = [*self.results.warnings, *mixing]
+        if any(claim.letter == "e" for claim in self.claims):
+            found += mixed_measurements(self.results.timed)
+        return list(dict.fromkeys(found))
 
     @property
     def diverged(self) -> list[tuple[str, str]]:

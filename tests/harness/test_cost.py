@@ -12,6 +12,7 @@ from harness import cost
 from harness.cost import CostError, measure_in_turn
 from harness.suite import SuiteError
 
+HERE = {"commit": "0123456789abcdef", "clean": False, "processor": "Fast 9", "cores": 2}
 ENVIRONMENTS = {"Hopper": "Hopper-id", "Ant": "Ant-id"}
 
 
@@ -32,6 +33,7 @@ def commands(monkeypatch) -> list[list[str]]:
         return subprocess.CompletedProcess(command, 0, "", "")
 
     monkeypatch.setattr(cost.subprocess, "run", run)
+    monkeypatch.setattr(cost, "here", lambda: HERE)
     return given
 
 
@@ -42,6 +44,15 @@ def test_a_repetition_is_a_pair_without_its_first_update(commands):
     assert timed["reg"].tolist() == pytest.approx([2e-3] * 8)
     assert timed["environment"].tolist()[:2] == ["Hopper", "Ant"]
     assert len(commands) == 16
+
+
+def test_each_repetition_says_where_and_when_it_was_measured(commands, monkeypatch):
+    times = iter(["2026-02-03T04:05:06+00:00", "2026-02-03T04:05:07+00:00"])
+    monkeypatch.setattr(cost, "now", lambda: next(times))
+    timed = measure_in_turn({"Hopper": "Hopper-id"}, ["compiled"], 2, 3, lambda _: None)
+    assert timed["commit"].tolist() == ["0123456789+"] * 2
+    assert timed["machine"].tolist() == ["Fast 9, 2 cores"] * 2
+    assert timed["date"].tolist() == ["2026-02-03T04:05:06+00:00", "2026-02-03T04:05:07+00:00"]
 
 
 def test_the_arms_change_who_goes_first(commands):

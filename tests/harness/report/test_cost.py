@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pandas as pd
 import pytest
 
+from harness.cost import CostError
 from harness.report.cost import added_time, cost_claim
+from harness.report.part import make_part
 from harness.report.results import load_results
 from harness.store import read_json, write_json
 from harness.suite import load_suite
@@ -100,18 +104,72 @@ def test_without_pairs_there_is_no_finding(store):
     assert (claim.findings, claim.verdict) == ([], "undecided")
 
 
-def test_what_was_measured_in_turn_has_the_say(store):
-    """The runs' own speeds say +20%; the six repetitions say +2%."""
+def measure(store, **changes) -> None:
+    """Six repetitions that say +2%."""
     timed = pd.DataFrame(
         {
             "algorithm": "PPO", "implementation": "population", "environment": "Hopper",
-            "repetition": range(6), "plain": 1e-3, "reg": 1.02e-3,
+            "repetition": range(6), "plain": 1e-3, "reg": 1.02e-3, "commit": "abcdef0123",
+            "machine": "Fast 9, 2 cores", "date": "2026-02-03T04:05:06+00:00", **changes,
         }
     )  # fmt: skip
     store.root.mkdir(parents=True)
     timed.to_csv(store.root / "cost.csv", index=False)
+
+
+def test_what_was_measured_in_turn_has_the_say(store):
+    """The runs' own speeds say +20%; the six repetitions say +2%."""
+    measure(store)
     claim = claim_of(store, lambda *_: 1000 / 1.2)
     (finding,) = claim.findings
     assert finding.about.endswith("in turn, Hopper, population")
     assert finding.estimate.mean == pytest.approx(0.02)
     assert claim.verdict == "supported"
+
+
+def test_what_a_measurement_comes_from_stands_beside_the_verdict(store):
+    measure(store, date=["2026-02-03T04:05:06+00:00"] * 3 + ["2026-02-04T00:00:00+00:00"] * 3)
+    same = {"commit": "abcdef0123456789", "clean": True, "processor": "Fast 9", "cores": 2}
+    claim = claim_of(store, lambda *_: 1000.0, said=lambda _: same)
+    assert claim.notes == (
+        "Implementations: population. Measured on both arms in turn, alone.",
+        "Commit abcdef0123; Fast 9, 2 cores; 2026-02-03 to 2026-02-04.",
+    )
+
+
+def test_a_measurement_from_elsewhere_than_the_runs_says_so(store):
+    measure(store)
+    other = {"commit": "9876543210fedcba", "clean": False, "processor": "Slow 1", "cores": 4}
+    claim = claim_of(store, lambda *_: 1000.0, said=lambda _: other)
+    assert claim.notes[1:] == (
+        "Commit abcdef0123; Fast 9, 2 cores; 2026-02-03.",
+        "The suite's own runs are of another commit: 9876543210+.",
+        "The suite's own runs are of another machine: Slow 1, 4 cores.",
+    )
+
+
+def test_measurements_that_mix_are_a_warning(study, store, tmp_path):
+    results = study(lambda _, __, agent: 1.0 * agent)
+    for commits, warnings in (
+        (["abcdef0123"] * 6, []),
+        (["abcdef0123"] * 4 + ["fedcba3210"] * 2,
+         ["The measurements of claim (e) mix commits: abcdef0123 (4), fedcba3210 (2)."]),
+    ):  # fmt: skip
+        timed = pd.DataFrame(
+            {
+                "algorithm": "PPO", "implementation": "population", "environment": "Hopper",
+                "repetition": range(6), "plain": 1e-3, "reg": 1.02e-3, "commit": commits,
+                "machine": "Fast 9, 2 cores", "date": "2026-02-03T04:05:06+00:00",
+            }
+        )  # fmt: skip
+        part = make_part(dataclasses.replace(results, timed=timed), tmp_path)
+        assert [line for line in part.warnings if "claim (e)" in line] == warnings
+
+
+@pytest.mark.parametrize("column", ["commit", "machine", "date"])
+def test_a_measurement_without_its_origin_is_to_be_made_again(store, column):
+    measure(store)
+    path = store.root / "cost.csv"
+    pd.read_csv(path).drop(columns=column).to_csv(path, index=False)
+    with pytest.raises(CostError, match=f"no {column}: .* Measure again with python -m harness"):
+        claim_of(store, lambda *_: 1000.0)
