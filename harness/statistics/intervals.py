@@ -1,4 +1,27 @@
-"""Intervals of a mean over agents."""
+"""Intervals of a mean over agents.
+
+How often 95% intervals hold the mean, in percent of 40,000 data sets:
+
+| scores                     | Student's, n = 5, 10, 30 | here, n = 5, 10, 30 |
+|----------------------------|--------------------------|---------------------|
+| normal                     | 95, 95, 95               | 95, 95, 95          |
+| exponential                | 88, 90, 93               | 91, 93, 95          |
+| lognormal (sigma = 1)      | 82, 84, 88               | 86, 89, 93          |
+| two values, 0.5 have one   | 94, 95, 96               | 94, 98, 97          |
+| two values, 0.3 have one   | 83, 96, 95               | 83, 97, 97          |
+| two values, 0.1 have one   | 41, 65, 93               | 41, 65, 95          |
+
+No end was further from all scores than a quarter of their range. A studentized bootstrap covers as
+well, but resamples of one value alone have next to no error, and its ends were up to thousands of
+ranges away. BCa covers normal scores in 83% and 90% at n = 5 and 10.
+
+Where the rare value is missing altogether no interval of these scores can help. So below 30 agents
+scores that look skewed have no interval, together with the other arms of their task if there are
+any. Scores that are judged by themselves pay for it: of ten lognormal ones 39% do not look skewed,
+and their intervals hold the mean in 78%.
+
+tests/harness/statistics/test_coverage.py draws the table.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +31,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-RESAMPLES = 10_000
 MANY = 30  # agents from which on the interval of a skewed cell can be trusted
 SKEWED = 1.0  # of the third standardized moment
+STEEP = 0.75  # the largest skewness times reach that is corrected in full
 
 
 class Estimate(NamedTuple):
@@ -22,34 +45,46 @@ class Estimate(NamedTuple):
     n: int
 
 
-def estimate_mean(values: np.ndarray, skewed: bool | None = None, seed: int = 0) -> Estimate:
-    """Mean of `values`, `[n]`, with a 95% studentized bootstrap interval.
+def estimate_mean(values: np.ndarray, skewed: bool | None = None) -> Estimate:
+    """Mean of `values`, `[n]`, with a 95% interval: Student's with Hall's correction for skewness.
 
-    Means of resamples are measured in their own standard errors, which keeps the interval honest
-    for ten agents (Efron and Tibshirani, 1993, chapter 12; SciPy has no such method). Below 30
-    agents skewed values have no interval: where a tenth of the agents succeed, ten of them often
-    hold no success at all. Nor have fewer than 5 agents.
+    Below 30 agents skewed values have no interval: where a tenth of the agents succeed, ten of them
+    often hold no success at all. Nor have fewer than 5 agents, nor values that are all equal: they
+    say nothing of how much others would differ.
 
     Args:
         values: One number for each agent.
         skewed: Whether the values come from a skewed distribution; by default they say it.
-        seed: Of the resampling.
     """
     values = np.asarray(values, dtype=np.float64)
     n = len(values)
     mean = float(values.mean()) if n else np.nan
-    if n < 5 or (n < MANY and (is_skewed([values]) if skewed is None else skewed)):
+    if n < 5 or np.ptp(values) == 0:
+        return Estimate(mean, np.nan, np.nan, n)
+    if n < MANY and (is_skewed([values]) if skewed is None else skewed):
         return Estimate(mean, np.nan, np.nan, n)
 
-    error = values.std(ddof=1) / np.sqrt(n)
-    picked = values[np.random.default_rng(seed).integers(n, size=(RESAMPLES, n))]
-    errors = picked.std(axis=1, ddof=1) / np.sqrt(n)
-    varied = errors > 0
-    if not varied.any():
-        return Estimate(mean, mean, mean, n)
-    scaled = (picked.mean(axis=1)[varied] - mean) / errors[varied]
-    below, above = np.percentile(scaled, (2.5, 97.5))
-    return Estimate(mean, float(mean - above * error), float(mean - below * error), n)
+    spread = values.std(ddof=1)
+    skewness = float(stats.skew(values))
+    reach = stats.t.ppf(0.975, n - 1) / np.sqrt(n)
+    low = mean - spread * _unskewed(reach, skewness, n)
+    high = mean - spread * _unskewed(-reach, skewness, n)
+    return Estimate(mean, float(low), float(high), n)
+
+
+def _unskewed(reach: float, skewness: float, n: int) -> float:
+    """How many deviations the mean is above the truth at this quantile of its transform.
+
+    With T = (mean - truth) / deviation and g the skewness, T + g T^2 / 3 + g^2 T^3 / 27 + g / 6n is
+    close to symmetric (Hall, 1992, "On the removal of skewness by transformation"). This inverts
+    it. For g = 0 it is `reach`, which is Student's. The inverse is steep where g * reach is near
+    -1, so g is limited.
+    """
+    limit = STEEP / abs(reach)
+    skewness = float(np.clip(skewness, -limit, limit))
+    if abs(skewness) < 1e-6:
+        return reach
+    return float(3 / skewness * (np.cbrt(1 + skewness * (reach - skewness / (6 * n))) - 1))
 
 
 def is_skewed(arms: Sequence[np.ndarray]) -> bool:

@@ -117,15 +117,8 @@ def make_cells(results: Results, outcome: str = "reward") -> list[Cell]:
 
 
 def _estimate(scores: np.ndarray, arms: list[np.ndarray]) -> Estimate:
-    """A cell's mean, with its interval unless the cell or its task is skewed.
-
-    Where scores take two values, some resamples have next to no spread of their own, and the
-    studentized interval breaks down: one of over twice the scores' range is left out.
-    """
-    found = estimate_mean(scores, skewed=is_skewed(arms) or is_skewed([scores]))
-    if found.n and found.high - found.low > 2 * np.ptp(scores):
-        return found._replace(low=np.nan, high=np.nan)
-    return found
+    """A cell's mean, with its interval unless the cell or its task is skewed."""
+    return estimate_mean(scores, skewed=is_skewed(arms) or is_skewed([scores]))
 
 
 def algorithms_of(suite: Suite) -> list[str]:
@@ -165,10 +158,10 @@ def notes(results: Results, cells: list[Cell]) -> list[str]:
         )
     if any(cell.agents > 1 for cell in run):
         lines.append(
-            "[Brackets] hold the 95% studentized bootstrap interval of the mean over agents. "
-            "{Braces} hold the smallest and the largest score, where there are fewer than 5 "
-            "agents, or fewer than 30 with skewed or two-valued scores: no interval can be trusted "
-            "there."
+            "[Brackets] hold the 95% interval of the mean over agents, Student's with a correction "
+            "for skewness. {Braces} hold the smallest and the largest score, where there are fewer "
+            "than 5 agents, or fewer than 30 with skewed scores, or where all scores are equal: no "
+            "interval can be trusted there."
         )
         lines.append(
             "In parentheses: agents, failed ones among them, and the difference to an arm of the "

@@ -88,6 +88,8 @@ def test_the_whole_interval_must_be_on_one_side():
     """Of six the interval is the range."""
     below = added_time("x", "PPO", np.array([0.01, 0.02, 0.03, 0.05, 0.08, 0.1]))
     assert (below.estimate.low, below.estimate.high, below.verdict) == (0.01, 0.1, "supported")
+    over = added_time("x", "PPO", np.array([0.11] * 5 + [0.12]))
+    assert (over.p, np.isnan(over.p_holm)) == (2 / 64, True)  # of the limit, and not adjusted
     assert added_time("x", "PPO", np.array([0.0] * 5 + [0.11])).verdict == "undecided"
     assert added_time("x", "PPO", np.array([0.11] * 5 + [0.12])).verdict == "contradicted"
 
