@@ -33,6 +33,7 @@ from scipy import stats
 
 MANY = 30  # agents from which on the interval of a skewed cell can be trusted
 SKEWED = 1.0  # of the third standardized moment
+ROUNDING = 1e-12  # of the largest value: what differs by less is equal
 STEEP = 0.75  # the largest skewness times reach that is corrected in full
 
 
@@ -59,13 +60,13 @@ def estimate_mean(values: np.ndarray, skewed: bool | None = None) -> Estimate:
     values = np.asarray(values, dtype=np.float64)
     n = len(values)
     mean = float(values.mean()) if n else np.nan
-    if n < 5 or np.ptp(values) == 0:
+    if n < 5 or np.ptp(values) <= ROUNDING * np.abs(values).max():
         return Estimate(mean, np.nan, np.nan, n)
     if n < MANY and (is_skewed([values]) if skewed is None else skewed):
         return Estimate(mean, np.nan, np.nan, n)
 
     spread = values.std(ddof=1)
-    skewness = float(stats.skew(values))
+    skewness = float(stats.skew(values - mean))  # SciPy warns where the mean is far larger
     reach = stats.t.ppf(0.975, n - 1) / np.sqrt(n)
     low = mean - spread * _unskewed(reach, skewness, n)
     high = mean - spread * _unskewed(-reach, skewness, n)

@@ -39,6 +39,15 @@ def test_skewed_values_have_an_interval_that_leans():
 def test_equal_values_have_no_interval(n):
     """They say nothing of how much others would differ."""
     np.testing.assert_equal(estimate_mean(np.full(n, 3.0)), (3.0, np.nan, np.nan, n))
+    rounded = np.full(n, 0.3)
+    rounded[0] = 0.1 + 0.2
+    assert np.isnan(estimate_mean(rounded).low)
+
+
+def test_small_differences_of_large_values_have_an_interval():
+    offset = estimate_mean(np.arange(10.0) + 2.0**30)
+    expected = estimate_mean(np.arange(10.0))
+    assert offset.high - 2.0**30 == pytest.approx(expected.high, abs=1e-5)
 
 
 @pytest.mark.parametrize(
