@@ -356,10 +356,9 @@ def test_twelve_pairs_could_decide_one_of_sixteen_tasks(study):
     tasks = tuple("ABCDEFGH")
     results = study(
         lambda _, name, agent: agent + 3.0 * SIGNS[agent] * (name in ("PPO reg", "TRPO reg")),
-        algorithms=FOUR, tasks=tasks,
+        algorithms=FOUR, tasks=tasks, agents=2,
     )  # fmt: skip
     claim = claim_of(results)
-    assert claim.verdict == "undecided"
     for task in tasks:
         finding = found(claim, "TRPO reg - TRPO: reward", task)
         assert finding.note == "12 pairs could decide"
