@@ -71,6 +71,15 @@ def test_a_baselines_agent_is_the_one_that_was_trained(run):
         torch.testing.assert_close(found.policy(found.normalize(torch.as_tensor(obs))), expected)
 
 
+def test_an_agent_that_saw_raw_observations_of_a_bullet_task(run, tmp_path):
+    saved = torch.load(run[0] / "checkpoint.pt", weights_only=True)
+    saved["args"] |= {"norm_obs": False, "env_id": "HopperBulletEnv-v0"}
+    torch.save(saved, tmp_path / "checkpoint.pt")
+    found = read_policy(str(tmp_path))
+    assert found.env_id == "pybullet_envs_gymnasium:HopperBulletEnv-v0"
+    assert found.normalize(torch.ones(1, 3)).tolist() == [[1.0, 1.0, 1.0]]
+
+
 def test_torchscript(tmp_path):
     path = tmp_path / "policy.pt"
     with pytest.warns(DeprecationWarning, match=r"torch\.jit"):
