@@ -55,101 +55,70 @@ class DivergedError(Exception):
 class Args(
     ConditioningArgs,  # condwrap
 ):
-    env_id: str = "HopperBulletEnv-v0"
-    """any Gymnasium task with a Box of actions; "module:id" imports the module first"""
-    seed: int = 1
-    """seed of the run"""
-    agent: int = 0
-    """number of the agent: the paper trains 10 for each seed"""
-    total_timesteps: int = 5_000_000
-    """environment steps to train for, rounded down to whole updates"""
-    num_envs: int = 1
-    """environments, stepped in turn"""
-    num_steps: int = 2000
-    """steps of each environment between two updates"""
-    num_minibatches: int = 40
-    """minibatches in an epoch: 40 of 2000 steps hold 50 each"""
-    update_epochs: int = 10
-    """passes over the rollout by the policy"""
-    learning_rate: float = 3e-4
-    """Adam's step size for the policy"""
-    vf_epochs: int = 10
-    """passes over the rollout by the critic"""
-    vf_learning_rate: float = 3e-4
-    """Adam's step size for the critic, which has an optimizer of its own"""
-    vf_coef: float = 0.5
-    """c2: factor of the critic's squared error. Adam divides it out again: with an optimizer of
-    its own the critic feels c2 only where the gradient is clipped"""
-    anneal_lr: bool = False
-    """let both step sizes fall linearly to 0"""
-    gamma: float = 0.99
-    """discount"""
-    gae_lambda: float = 0.95
-    """lambda of generalized advantage estimation"""
-    clip_coef: float = 0.2
-    """PPO's epsilon: how far the probability ratio may move from 1"""
-    ent_coef: float = 0.0
-    """c3: factor of the entropy bonus"""
-    max_grad_norm: float = 0.5
-    """length that the gradients of the policy and of the critic are clipped to"""
-    target_kl: float | None = None
-    """end the policy's epochs once an epoch's mean KL divergence exceeds this"""
-    hidden_sizes: tuple[int, ...] = (64, 64)
-    """widths of the hidden layers, of the policy and of the critic"""
-    activation: Literal["tanh", "relu"] = "tanh"
-    """what follows each hidden layer"""
-    output_gain: float = 0.01
-    """gain of the policy's orthogonal output layer; small ones start with actions near 0"""
-    log_std_init: float = 0.0
-    """log of the policy's standard deviation at the start"""
-    norm_obs: bool = True
-    """normalize observations by their running mean and variance, clipped to [-10, 10]"""
-    norm_reward: bool = True
-    """divide rewards, for learning only, by the running deviation of the discounted return"""
-    reward_clip: float = 10.0
-    """clip normalized rewards to [-reward_clip, reward_clip]; 0: do not clip"""
-    run_dir: Path | None = None
-    """where the run's files go; by default runs/<environment>__<this file>__s<seed>__a<agent>"""
-    resume: bool = False
-    """continue from the run directory's checkpoint, if it has one"""
-    extend: bool = False
-    """let a resumed run train for more timesteps than it was begun with"""
-    checkpoint_interval: int = 50
-    """updates between two checkpoints; the environments are rebuilt at each"""
-    compile: bool = False
-    """compile the loss (needs a C++ compiler): 12 s to start, then up to 1.4 times faster"""
-    track: bool = False
-    """log to Weights & Biases too (needs wandb; WANDB_PROJECT names the project)"""
+    env_id: str = "HopperBulletEnv-v0"  # a Gymnasium task with a Box of actions, or "module:id"
+    seed: int = 1  # seed of the run
+    agent: int = 0  # number of the agent: the paper trains 10 for each seed
+    total_timesteps: int = 5_000_000  # steps to train for, rounded down to whole updates
+
+    num_envs: int = 1  # environments, stepped in turn
+    num_steps: int = 2000  # steps of each environment between two updates
+    num_minibatches: int = 40  # minibatches in an epoch: 40 of 2000 steps hold 50 each
+    update_epochs: int = 10  # passes over the rollout by the policy
+    learning_rate: float = 3e-4  # Adam's step size for the policy
+    vf_epochs: int = 10  # passes over the rollout by the critic
+    vf_learning_rate: float = 3e-4  # Adam's step size for the critic, which has its own optimizer
+    vf_coef: float = 0.5  # c2, of the critic's squared error: acts only where gradients are clipped
+    anneal_lr: bool = False  # let both step sizes fall linearly to 0
+    gamma: float = 0.99  # discount
+    gae_lambda: float = 0.95  # lambda of generalized advantage estimation
+    clip_coef: float = 0.2  # PPO's epsilon: how far the probability ratio may move from 1
+    ent_coef: float = 0.0  # c3, of the entropy bonus
+    max_grad_norm: float = 0.5  # length that the policy's and the critic's gradients are clipped to
+    target_kl: float | None = None  # end the policy's epochs once the mean KL of one exceeds this
+
+    hidden_sizes: tuple[int, ...] = (64, 64)  # widths of the policy's and of the critic's layers
+    activation: Literal["tanh", "relu"] = "tanh"  # what follows each hidden layer
+    output_gain: float = 0.01  # of the policy's orthogonal output layer: small for actions near 0
+    log_std_init: float = 0.0  # log of the policy's standard deviation at the start
+
+    norm_obs: bool = True  # normalize observations by running statistics, clipped to [-10, 10]
+    norm_reward: bool = True  # divide rewards by the running deviation of the discounted return
+    reward_clip: float = 10.0  # clip normalized rewards to [-reward_clip, reward_clip]; 0: do not
+
+    run_dir: Path | None = None  # default: runs/<environment>__<this file>__s<seed>__a<agent>
+    resume: bool = False  # continue from the run directory's checkpoint, if it has one
+    extend: bool = False  # let a resumed run train for more timesteps than it was begun with
+    checkpoint_interval: int = 50  # updates between two checkpoints; each rebuilds the environments
+    compile: bool = False  # compile the loss with a C++ compiler: 12 s, then up to 1.4 times faster
+    track: bool = False  # log to Weights & Biases too (needs wandb; WANDB_PROJECT: the project)
 
     def __post_init__(self) -> None:
         counts = ("num_envs", "num_steps", "num_minibatches", "update_epochs", "vf_epochs")
-        least = dict.fromkeys((*counts, "checkpoint_interval"), 1)
-        for name, bound in {**least, "seed": 0, "agent": 0, "reward_clip": 0}.items():
-            if not getattr(self, name) >= bound:
-                raise ValueError(f"{name} must be at least {bound}, got {getattr(self, name)}")
-        if not all(size >= 1 for size in self.hidden_sizes):
-            raise ValueError(f"hidden_sizes must be at least 1, got {self.hidden_sizes}")
+        for name in (*counts, "checkpoint_interval"):
+            self.require(name, getattr(self, name) >= 1, "be at least 1")
+        for name in ("seed", "agent", "reward_clip"):
+            self.require(name, getattr(self, name) >= 0, "be at least 0")
 
         positive = ("learning_rate", "vf_learning_rate", "clip_coef", "max_grad_norm")
         for name in (*positive, "output_gain"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be finite and above 0, got {getattr(self, name)}")
-
+            self.require(name, 0 < getattr(self, name) < math.inf, "be finite and above 0")
         for name in ("gamma", "gae_lambda"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")
+            self.require(name, 0 <= getattr(self, name) <= 1, "be in [0, 1]")
+        self.require("hidden_sizes", min(self.hidden_sizes, default=1) >= 1, "be at least 1")
 
         batch = f"num_envs * num_steps = {self.batch_size}"
-        if self.batch_size % self.num_minibatches or self.batch_size == self.num_minibatches:
-            raise ValueError(
-                f"num_minibatches must divide {batch} into parts of 2 or more, "
-                f"got {self.num_minibatches}"
-            )
-        if self.total_timesteps < self.batch_size:
-            raise ValueError(
-                f"total_timesteps must be at least {batch}, got {self.total_timesteps}"
-            )
+        size, rest = divmod(self.batch_size, self.num_minibatches)
+        parts = f"divide {batch} into parts of 2 or more"
+        self.require("num_minibatches", size > 1 and not rest, parts)
+        self.require("total_timesteps", self.num_updates >= 1, f"be at least {batch}")
+
+        needed = "be False, since a run with anneal_lr depends on its length"
+        self.require("extend", not (self.extend and self.anneal_lr), needed)
         self.check_conditioning()  # condwrap
+
+    def require(self, name: str, holds: bool, what: str) -> None:
+        if not holds:
+            raise ValueError(f"{name} must {what}, got {getattr(self, name)!r}")
 
     @property
     def batch_size(self) -> int:
@@ -641,8 +610,6 @@ def check_same(args: Args, saved: dict[str, Any]) -> None:
         if value != now and not (longer and name == "total_timesteps"):
             raise RunError(f"{args.path} was run with {name}={value}, not {now}")
 
-    if longer and getattr(args, "anneal_lr", False):
-        raise RunError("a run with --anneal-lr depends on its length: it cannot be extended")
     update = saved["learner"]["update"]
     if longer and update % args.checkpoint_interval:
         raise RunError(

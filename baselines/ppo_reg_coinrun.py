@@ -63,134 +63,92 @@ class DivergedError(Exception):
 class Args(
     PenaltyArgs,  # condwrap
 ):
-    env_id: str = "coinrun"
-    """coinrun, or another of Procgen's 16 games"""
-    seed: int = 1
-    """seed of the run"""
-    agent: int = 0
-    """number of the agent, for several of one seed"""
-    total_timesteps: int = 50_000_000
-    """steps to train for, rounded down to whole updates; those that EnvPool spends on resets count
-    here, and not in global_step"""
-    num_levels: int = 500
-    """levels to train on; 0: an unlimited set"""
-    start_level: int = 0
-    """seed of the first of them"""
-    distribution_mode: Literal["easy", "hard"] = "hard"
-    """how hard the levels are"""
-    paint_vel_info: bool = True
-    """paint the agent's velocity into the frame, as the original CoinRun does"""
-    restrict_themes: bool = False
-    """show one theme each of the player, the ground, the crates and the enemies, not all"""
-    num_envs: int = 32
-    """environments; Lee et al. use 32 in each worker"""
-    num_groups: int = 2
-    """groups of environments: the network acts for one while another's simulators step"""
-    num_threads: int = 0
-    """CPU threads; 0: as many as PyTorch takes (OMP_NUM_THREADS, or all cores)"""
-    num_steps: int = 256
-    """steps of each environment between two updates"""
-    num_minibatches: int = 8
-    """minibatches in an epoch"""
-    update_epochs: int = 3
-    """passes over the rollout"""
-    learning_rate: float = 5e-4
-    """Adam's step size"""
-    anneal: bool = True
-    """let the step size and clip_coef fall linearly to 0"""
-    anneal_timesteps: int = 0
-    """steps in which they would reach 0; Lee et al. take 256,000,000; 0: the run's own length"""
-    gamma: float = 0.999
-    """discount"""
-    gae_lambda: float = 0.95
-    """lambda of generalized advantage estimation"""
-    clip_coef: float = 0.2
-    """PPO's epsilon: how far the probability ratio may move from 1"""
-    ent_coef: float = 0.01
-    """c3: factor of the entropy bonus"""
-    vf_coef: float = 0.5
-    """c2: factor of half the critic's squared error"""
-    max_grad_norm: float = 0.5
-    """length that the gradient is clipped to"""
-    network: Literal["nature", "impala", "impala_large"] = "nature"
-    """convolutions of Mnih et al. (2015) or Espeholt et al. (2018), the latter in two sizes"""
-    l2: float = 0.0
-    """factor of half the squared weights, biases not counted; Lee et al. take 1e-4"""
-    dropout: float = 0.0
-    """share of features left out, the same in a whole batch: after each convolution of IMPALA, as
-    in Lee et al.'s code, which takes 0.1, and of NatureCNN, which has none there, in the last layer
-    """
-    eval_dropout: bool = False
-    """leave them out in evaluation too, as Lee et al.'s code does: those of the last update"""
+    env_id: str = "coinrun"  # or another of Procgen's 16 games
+    seed: int = 1  # seed of the run
+    agent: int = 0  # number of the agent, for several of one seed
+    # EnvPool spends steps on resets: they count in total_timesteps, and not in global_step
+    total_timesteps: int = 50_000_000  # steps to train for, rounded down to whole updates
+
+    num_levels: int = 500  # levels to train on; 0: an unlimited set
+    start_level: int = 0  # seed of the first of them
+    distribution_mode: Literal["easy", "hard"] = "hard"  # how hard the levels are
+    paint_vel_info: bool = True  # paint the velocity into the frame, as the original CoinRun does
+    restrict_themes: bool = False  # show one theme each of player, ground, crates and enemies
+    num_envs: int = 32  # environments; Lee et al. use 32 in each worker
+    num_groups: int = 2  # groups of environments: the network acts for one while others step
+    num_threads: int = 0  # CPU threads; 0: as many as PyTorch takes (OMP_NUM_THREADS, or all cores)
+
+    num_steps: int = 256  # steps of each environment between two updates
+    num_minibatches: int = 8  # minibatches in an epoch
+    update_epochs: int = 3  # passes over the rollout
+    learning_rate: float = 5e-4  # Adam's step size
+    anneal: bool = True  # let the step size and clip_coef fall linearly to 0
+    anneal_timesteps: int = 0  # steps to reach 0 in: 256,000,000 in Lee et al.; 0: the run's length
+    gamma: float = 0.999  # discount
+    gae_lambda: float = 0.95  # lambda of generalized advantage estimation
+    clip_coef: float = 0.2  # PPO's epsilon: how far the probability ratio may move from 1
+    ent_coef: float = 0.01  # c3, of the entropy bonus
+    vf_coef: float = 0.5  # c2, of half the critic's squared error
+    max_grad_norm: float = 0.5  # length that the gradient is clipped to
+
+    network: Literal["nature", "impala", "impala_large"] = "nature"  # Mnih et al.'s or Espeholt's
+    l2: float = 0.0  # factor of half the squared weights, without biases; Lee et al. take 1e-4
+    # Dropped features are the same in a whole batch. Lee et al. drop 0.1 of them after each
+    # convolution of IMPALA, and none of NatureCNN, which here drops those of its last layer.
+    dropout: float = 0.0  # share of features left out, as in Lee et al.'s code
+    eval_dropout: bool = False  # leave out those of the last update in evaluation too, as they do
     probe_fraction: float = 0.125  # condwrap
     """share of each rollout that psi and J are logged from"""  # condwrap
-    eval_interval: int = 100
-    """updates between two evaluations on training and on unseen levels; 0: never"""
-    eval_envs: int = 64
-    """episodes of each evaluation, one in each environment"""
-    device: str = "auto"
-    """cpu, cuda or cuda:1; auto: a GPU if there is one"""
-    bf16: bool = False
-    """compute in bfloat16, except for the penalty"""
-    compile: bool = False
-    """compile acting, into CUDA graphs on a GPU, and the loss"""
-    run_dir: Path | None = None
-    """where the run's files go; by default runs/<game>__<this file>__s<seed>__a<agent>"""
-    resume: bool = False
-    """continue from the run directory's checkpoint, if it has one"""
-    extend: bool = False
-    """let a resumed run train for more timesteps than it was begun with"""
-    checkpoint_interval: int = 50
-    """updates between two checkpoints; the environments are rebuilt at each"""
-    track: bool = False
-    """log to Weights & Biases too (needs wandb; WANDB_PROJECT names the project)"""
+    eval_interval: int = 100  # updates between evaluations on training and unseen levels; 0: never
+    eval_envs: int = 64  # episodes of each evaluation, one in each environment
+
+    device: str = "auto"  # cpu, cuda or cuda:1; auto: a GPU if there is one
+    bf16: bool = False  # compute in bfloat16, except for the penalty
+    compile: bool = False  # compile acting, into CUDA graphs on a GPU, and the loss
+    run_dir: Path | None = None  # default: runs/<game>__<this file>__s<seed>__a<agent>
+    resume: bool = False  # continue from the run directory's checkpoint, if it has one
+    extend: bool = False  # let a resumed run train for more timesteps than it was begun with
+    checkpoint_interval: int = 50  # updates between two checkpoints; each rebuilds the environments
+    track: bool = False  # log to Weights & Biases too (needs wandb; WANDB_PROJECT: the project)
 
     def __post_init__(self) -> None:
-        if self.env_id not in GAMES:
-            raise ValueError(f"env_id must be one of {', '.join(GAMES)}, got {self.env_id!r}")
-        if self.distribution_mode not in ("easy", "hard"):
-            raise ValueError(
-                f"distribution_mode must be easy or hard, got {self.distribution_mode!r}"
-            )
+        self.require("env_id", self.env_id in GAMES, f"be one of {', '.join(GAMES)}")
+        modes = ("easy", "hard")
+        self.require("distribution_mode", self.distribution_mode in modes, "be easy or hard")
 
         counts = ("num_envs", "num_groups", "num_steps", "num_minibatches", "update_epochs")
-        least = dict.fromkeys((*counts, "eval_envs", "checkpoint_interval"), 1)
+        for name in (*counts, "eval_envs", "checkpoint_interval"):
+            self.require(name, getattr(self, name) >= 1, "be at least 1")
         from_0 = ("seed", "agent", "num_levels", "start_level", "num_threads", "eval_interval")
-        least.update(dict.fromkeys((*from_0, "anneal_timesteps", "l2", "ent_coef", "vf_coef"), 0))
-        for name, bound in least.items():
-            if not bound <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be at least {bound}, got {getattr(self, name)}")
+        for name in (*from_0, "anneal_timesteps", "l2", "ent_coef", "vf_coef"):
+            self.require(name, 0 <= getattr(self, name) < math.inf, "be at least 0")
 
         for name in ("learning_rate", "clip_coef", "max_grad_norm"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be finite and above 0, got {getattr(self, name)}")
-
+            self.require(name, 0 < getattr(self, name) < math.inf, "be finite and above 0")
         for name in ("gamma", "gae_lambda"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")
-        if not 0 <= self.dropout < 1:
-            raise ValueError(f"dropout must be in [0, 1), got {self.dropout}")
+            self.require(name, 0 <= getattr(self, name) <= 1, "be in [0, 1]")
+        self.require("dropout", 0 <= self.dropout < 1, "be in [0, 1)")
 
-        if self.num_envs % self.num_groups:
-            raise ValueError(
-                f"num_groups must divide num_envs = {self.num_envs}, got {self.num_groups}"
-            )
+        whole = self.num_envs % self.num_groups == 0
+        self.require("num_groups", whole, f"divide num_envs = {self.num_envs}")
         batch = f"num_envs * num_steps = {self.batch_size}"
-        if self.batch_size % self.num_minibatches or self.batch_size == self.num_minibatches:
-            raise ValueError(
-                f"num_minibatches must divide {batch} into parts of 2 or more, "
-                f"got {self.num_minibatches}"
-            )
-        if self.total_timesteps < self.batch_size:
-            raise ValueError(
-                f"total_timesteps must be at least {batch}, got {self.total_timesteps}"
-            )
-        if 0 < self.anneal_timesteps < self.total_timesteps:
-            raise ValueError(
-                f"anneal_timesteps must be 0 or at least total_timesteps = {self.total_timesteps}, "
-                f"got {self.anneal_timesteps}"
-            )
+        size, rest = divmod(self.batch_size, self.num_minibatches)
+        parts = f"divide {batch} into parts of 2 or more"
+        self.require("num_minibatches", size > 1 and not rest, parts)
+        self.require("total_timesteps", self.num_updates >= 1, f"be at least {batch}")
+
+        too_short = 0 < self.anneal_timesteps < self.total_timesteps
+        needed = f"be 0 or at least total_timesteps = {self.total_timesteps}"
+        self.require("anneal_timesteps", not too_short, needed)
+
+        anneals_to_its_end = self.anneal and not self.anneal_timesteps
+        needed = "be False, since a run that anneals over its own length depends on it"
+        self.require("extend", not (self.extend and anneals_to_its_end), needed)
         self.check_conditioning()  # condwrap
+
+    def require(self, name: str, holds: bool, what: str) -> None:
+        if not holds:
+            raise ValueError(f"{name} must {what}, got {getattr(self, name)!r}")
 
     @property
     def batch_size(self) -> int:
@@ -941,11 +899,6 @@ def check_same(args: Args, saved: dict[str, Any]) -> None:
         if value != now and not (longer and name == "total_timesteps"):
             raise RunError(f"{args.path} was run with {name}={value}, not {now}")
 
-    if longer and args.anneal and not args.anneal_timesteps:
-        raise RunError(
-            "a run that anneals over its own length depends on it: it cannot be extended, unless "
-            "it began with --no-anneal or with --anneal-timesteps"
-        )
     update = saved["learner"]["update"]
     if longer and update % args.checkpoint_interval:
         raise RunError(

@@ -56,98 +56,66 @@ class DivergedError(Exception):
 class Args(
     ConditioningArgs,  # condwrap
 ):
-    env_id: str = "HopperBulletEnv-v0"
-    """any Gymnasium task with a Box of actions; "module:id" imports the module first"""
-    seed: int = 1
-    """seed of the run"""
-    agent: int = 0
-    """number of the agent: the paper trains 10 for each seed"""
-    total_timesteps: int = 5_000_000
-    """environment steps to train for, rounded down to whole updates"""
-    num_envs: int = 1
-    """environments, stepped in turn"""
-    num_steps: int = 2000
-    """steps of each environment between two updates"""
-    num_minibatches: int = 40
-    """minibatches in an epoch of the critic: 40 of 2000 steps hold 50 each"""
-    target_kl: float = 0.01
-    """delta_kl: bound on the mean KL divergence of a step"""
-    cg_steps: int = 10
-    """conjugate-gradient steps towards the natural gradient"""
-    cg_damping: float = 0.1
-    """added to the diagonal of the Fisher matrix"""
-    line_search_steps: int = 10
-    """fractions of the full step that are tried"""
-    line_search_shrink: float = 0.8
-    """each fraction over the one before it: 0.8 is sb3-contrib's, TRPO's paper names none"""
-    vf_epochs: int = 10
-    """passes over the rollout by the critic"""
-    vf_learning_rate: float = 3e-4
-    """Adam's step size for the critic. The critic is that of ppo_reg.py, so that comparing the two
-    compares policies: 3e-4, 10 epochs, minibatches of about 64 (Schulman et al., 2017, Table 3)"""
-    vf_coef: float = 0.5
-    """c2: factor of the critic's squared error. Adam divides it out again: the critic feels c2 only
-    where the gradient is clipped"""
-    gamma: float = 0.99
-    """discount"""
-    gae_lambda: float = 0.95
-    """lambda of generalized advantage estimation"""
-    max_grad_norm: float = 0.5
-    """length that the critic's gradient is clipped to"""
-    hidden_sizes: tuple[int, ...] = (64, 64)
-    """widths of the hidden layers, of the policy and of the critic"""
-    activation: Literal["tanh", "relu"] = "tanh"
-    """what follows each hidden layer"""
-    output_gain: float = 0.01
-    """gain of the policy's orthogonal output layer; small ones start with actions near 0"""
-    log_std_init: float = 0.0
-    """log of the policy's standard deviation at the start"""
-    norm_obs: bool = True
-    """normalize observations by their running mean and variance, clipped to [-10, 10]"""
-    norm_reward: bool = True
-    """divide rewards, for learning only, by the running deviation of the discounted return"""
-    reward_clip: float = 10.0
-    """clip normalized rewards to [-reward_clip, reward_clip]; 0: do not clip"""
-    run_dir: Path | None = None
-    """where the run's files go; by default runs/<environment>__<this file>__s<seed>__a<agent>"""
-    resume: bool = False
-    """continue from the run directory's checkpoint, if it has one"""
-    extend: bool = False
-    """let a resumed run train for more timesteps than it was begun with"""
-    checkpoint_interval: int = 50
-    """updates between two checkpoints; the environments are rebuilt at each"""
-    track: bool = False
-    """log to Weights & Biases too (needs wandb; WANDB_PROJECT names the project)"""
+    env_id: str = "HopperBulletEnv-v0"  # a Gymnasium task with a Box of actions, or "module:id"
+    seed: int = 1  # seed of the run
+    agent: int = 0  # number of the agent: the paper trains 10 for each seed
+    total_timesteps: int = 5_000_000  # steps to train for, rounded down to whole updates
+
+    num_envs: int = 1  # environments, stepped in turn
+    num_steps: int = 2000  # steps of each environment between two updates
+    num_minibatches: int = 40  # minibatches in the critic's epochs: 40 of 2000 steps hold 50 each
+    target_kl: float = 0.01  # delta_kl: bound on the mean KL divergence of a step
+    cg_steps: int = 10  # conjugate-gradient steps towards the natural gradient
+    cg_damping: float = 0.1  # added to the diagonal of the Fisher matrix
+    line_search_steps: int = 10  # fractions of the full step that are tried
+    line_search_shrink: float = 0.8  # each fraction over the one before it, as in sb3-contrib
+    # The critic is that of ppo_reg.py, so that comparing the two compares policies: 3e-4, 10 epochs
+    # and minibatches of about 64 are Schulman et al.'s (2017, Table 3).
+    vf_epochs: int = 10  # passes over the rollout by the critic
+    vf_learning_rate: float = 3e-4  # Adam's step size for the critic
+    vf_coef: float = 0.5  # c2, of the critic's squared error: acts only where gradients are clipped
+    gamma: float = 0.99  # discount
+    gae_lambda: float = 0.95  # lambda of generalized advantage estimation
+    max_grad_norm: float = 0.5  # length that the critic's gradient is clipped to
+
+    hidden_sizes: tuple[int, ...] = (64, 64)  # widths of the policy's and of the critic's layers
+    activation: Literal["tanh", "relu"] = "tanh"  # what follows each hidden layer
+    output_gain: float = 0.01  # of the policy's orthogonal output layer: small for actions near 0
+    log_std_init: float = 0.0  # log of the policy's standard deviation at the start
+
+    norm_obs: bool = True  # normalize observations by running statistics, clipped to [-10, 10]
+    norm_reward: bool = True  # divide rewards by the running deviation of the discounted return
+    reward_clip: float = 10.0  # clip normalized rewards to [-reward_clip, reward_clip]; 0: do not
+
+    run_dir: Path | None = None  # default: runs/<environment>__<this file>__s<seed>__a<agent>
+    resume: bool = False  # continue from the run directory's checkpoint, if it has one
+    extend: bool = False  # let a resumed run train for more timesteps than it was begun with
+    checkpoint_interval: int = 50  # updates between two checkpoints; each rebuilds the environments
+    track: bool = False  # log to Weights & Biases too (needs wandb; WANDB_PROJECT: the project)
 
     def __post_init__(self) -> None:
         counts = ("num_envs", "num_steps", "num_minibatches", "vf_epochs", "checkpoint_interval")
-        least = dict.fromkeys((*counts, "cg_steps", "line_search_steps"), 1)
-        for name, bound in {**least, "seed": 0, "agent": 0, "reward_clip": 0}.items():
-            if not getattr(self, name) >= bound:
-                raise ValueError(f"{name} must be at least {bound}, got {getattr(self, name)}")
-        if not all(size >= 1 for size in self.hidden_sizes):
-            raise ValueError(f"hidden_sizes must be at least 1, got {self.hidden_sizes}")
+        for name in (*counts, "cg_steps", "line_search_steps"):
+            self.require(name, getattr(self, name) >= 1, "be at least 1")
+        for name in ("seed", "agent", "reward_clip"):
+            self.require(name, getattr(self, name) >= 0, "be at least 0")
 
-        positive = ("target_kl", "cg_damping", "vf_learning_rate", "max_grad_norm", "output_gain")
-        for name in positive:
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be finite and above 0, got {getattr(self, name)}")
-
+        for name in ("target_kl", "cg_damping", "vf_learning_rate", "max_grad_norm", "output_gain"):
+            self.require(name, 0 < getattr(self, name) < math.inf, "be finite and above 0")
         for name in ("gamma", "gae_lambda", "line_search_shrink"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")
+            self.require(name, 0 <= getattr(self, name) <= 1, "be in [0, 1]")
+        self.require("hidden_sizes", min(self.hidden_sizes, default=1) >= 1, "be at least 1")
 
         batch = f"num_envs * num_steps = {self.batch_size}"
-        if self.batch_size % self.num_minibatches or self.batch_size == self.num_minibatches:
-            raise ValueError(
-                f"num_minibatches must divide {batch} into parts of 2 or more, "
-                f"got {self.num_minibatches}"
-            )
-        if self.total_timesteps < self.batch_size:
-            raise ValueError(
-                f"total_timesteps must be at least {batch}, got {self.total_timesteps}"
-            )
+        size, rest = divmod(self.batch_size, self.num_minibatches)
+        parts = f"divide {batch} into parts of 2 or more"
+        self.require("num_minibatches", size > 1 and not rest, parts)
+        self.require("total_timesteps", self.num_updates >= 1, f"be at least {batch}")
         self.check_conditioning()  # condwrap
+
+    def require(self, name: str, holds: bool, what: str) -> None:
+        if not holds:
+            raise ValueError(f"{name} must {what}, got {getattr(self, name)!r}")
 
     @property
     def batch_size(self) -> int:
@@ -737,8 +705,6 @@ def check_same(args: Args, saved: dict[str, Any]) -> None:
         if value != now and not (longer and name == "total_timesteps"):
             raise RunError(f"{args.path} was run with {name}={value}, not {now}")
 
-    if longer and getattr(args, "anneal_lr", False):
-        raise RunError("a run with --anneal-lr depends on its length: it cannot be extended")
     update = saved["learner"]["update"]
     if longer and update % args.checkpoint_interval:
         raise RunError(

@@ -1168,5 +1168,7 @@ def test_what_cannot_be_extended_is_refused(tmp_path, changes, message):
 def test_an_annealed_run_cannot_be_extended(tmp_path):
     train(pendulum(ppo_reg, tmp_path, anneal_lr=True))
     longer = {"total_timesteps": 640, "resume": True, "extend": True}
-    with pytest.raises(RunError, match="depends on its length"):
+    with pytest.raises(ValueError, match=r"^extend must be False, .* on its length, got"):
         train(pendulum(ppo_reg, tmp_path, anneal_lr=True, **longer))
+    with pytest.raises(RunError, match="was run with anneal_lr=True, not False"):
+        train(pendulum(ppo_reg, tmp_path, **longer))

@@ -728,7 +728,6 @@ def test_an_extended_run_is_the_longer_run_bit_for_bit(tmp_path, changes):
     ("begun", "changes", "message"),
     [
         ({"anneal": False}, {}, "was run with total_timesteps=64, not 128"),
-        ({"anneal": True}, {"extend": True}, "anneals over its own length depends on it"),
         ({"anneal": False, "checkpoint_interval": 2}, {"extend": True},
          "its 1 updates are not a multiple of checkpoint_interval=2"),
     ],
@@ -833,6 +832,7 @@ def test_help_names_every_flag_and_no_marker(monkeypatch, capsys):
         ({"num_minibatches": 7}, r"num_envs \* num_steps = 64 into parts of 2 or more, got 7"),
         ({"num_minibatches": 64}, "into parts of 2 or more, got 64"),
         ({"total_timesteps": 63}, r"must be at least num_envs \* num_steps = 64, got 63"),
+        ({"extend": True}, "extend must be False, .* anneals over its own length depends on it"),
         ({"dropout": 1.0}, r"dropout must be in \[0, 1\), got 1.0"),
         ({"dropout": -0.1}, r"dropout must be in \[0, 1\), got -0.1"),
         ({"l2": -1e-4}, "l2 must be at least 0"),
