@@ -679,8 +679,8 @@ def train(args: PopulationArgs, update: Callable[..., Any]) -> list[Any]:
             speed = steps / (now - started)
             rows = []
             for i in live:
-                row = single.make_row(runs[i], learners[i], rollouts[i], losses[i], speed)
-                single.write_metrics(runs[i], writers[i], row)
+                numbers = {"charts/SPS": speed, **losses[i]}
+                row = single.log_update(runs[i], learners[i], writers[i], rollouts[i], numbers)
                 rows.append(row)
             if now - printed > 10 or learners[0].update == args.num_updates:
                 printed = now

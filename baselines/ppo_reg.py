@@ -29,11 +29,11 @@ import numpy as np
 import torch
 import tyro
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space
 from gymnasium.wrappers.utils import RunningMeanStd
 from gymnasium.wrappers.vector import ClipReward, NormalizeReward, RecordEpisodeStatistics
 from torch import Tensor, nn
 from torch.distributions import Independent, Normal
-from torch.nn.utils import parameters_to_vector
 from torch.utils.tensorboard import SummaryWriter
 
 from condwrap.settings import ConditioningArgs  # condwrap
@@ -161,19 +161,17 @@ class NormalizeObservation(VectorWrapper):
 
         shape = env.single_observation_space.shape
         self.single_observation_space = gym.spaces.Box(-OBS_CLIP, OBS_CLIP, shape, np.float32)
-        self.observation_space = gym.vector.utils.batch_space(
-            self.single_observation_space, env.num_envs
-        )
+        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
 
     def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict]:
         obs, info = self.env.reset(**kwargs)
         return self.observe(obs), info
 
     def step(self, actions: np.ndarray) -> tuple:
-        obs, rewards, terminations, truncations, info = self.env.step(actions)
+        obs, *rewards_and_ends, info = self.env.step(actions)
         for i in np.flatnonzero(info.get("_final_obs", ())):
             info["final_obs"][i] = self.normalize(info["final_obs"][i])
-        return self.observe(obs), rewards, terminations, truncations, info
+        return self.observe(obs), *rewards_and_ends, info
 
     def observe(self, obs: np.ndarray) -> np.ndarray:
         if self.update:
@@ -225,11 +223,10 @@ def env_seeds(args: Args, checkpoint: int) -> list[int]:
 
 # --- agent ----------------------------------------------------------------------------------------
 
-ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU}
-
 
 def make_mlp(args: Args, n_in: int, n_out: int, gain: float, rng: torch.Generator) -> nn.Sequential:
     """Layers with orthogonal weights, `gain` at the output, drawn from `rng` alone."""
+    activation = nn.Tanh if args.activation == "tanh" else nn.ReLU
     layers: list[nn.Module] = []
     sizes = (n_in, *args.hidden_sizes, n_out)
     for i, size in enumerate(sizes[1:]):
@@ -237,7 +234,7 @@ def make_mlp(args: Args, n_in: int, n_out: int, gain: float, rng: torch.Generato
         linear = nn.utils.skip_init(nn.Linear, sizes[i], size)
         nn.init.orthogonal_(linear.weight, gain if is_output else math.sqrt(2), rng)
         nn.init.zeros_(linear.bias)
-        layers += [linear, ACTIVATIONS[args.activation]()]
+        layers += [linear, activation()]
 
     return nn.Sequential(*layers[:-1])
 
@@ -263,17 +260,16 @@ class Learner:
         self.stats: dict[str, RunningMeanStd] = {}
         envs = make_envs(args, self.stats)
         obs_dim = math.prod(envs.single_observation_space.shape)
-        action_dim = math.prod(envs.single_action_space.shape)
+        space = envs.single_action_space
+        action_dim = math.prod(space.shape)
         envs.close()
 
         # each use of randomness has its own stream
         names = ("init", "action", "minibatch", "penalty", "probe")
         streams = np.random.SeedSequence((args.seed, args.agent)).spawn(len(names))
-        seeds = [int(stream.generate_state(1, np.uint64)[0]) for stream in streams]
-        self.generators = {
-            name: torch.Generator().manual_seed(seed)
-            for name, seed in zip(names[:3], seeds[:3], strict=True)
-        }
+        numbers = [int(stream.generate_state(1, np.uint64)[0]) for stream in streams]
+        seeds = dict(zip(names, numbers, strict=True))
+        self.generators = {x: torch.Generator().manual_seed(seeds[x]) for x in names[:3]}
 
         self.actor = Actor(args, obs_dim, action_dim, self.generators["init"])
         self.critic = make_mlp(args, obs_dim, 1, 1.0, self.generators["init"])
@@ -282,13 +278,13 @@ class Learner:
         self.critic_optimizer = adam(self.critic.parameters(), args.vf_learning_rate)
         self.actor_loss = torch.compile(actor_loss) if args.compile else actor_loss
 
-        self.regularizer = args.make_regularizer(seeds[3])  # condwrap
-        self.probe = args.make_probe(seeds[4], action_space=envs.single_action_space)  # condwrap
+        self.regularizer = args.make_regularizer(seeds["penalty"])  # condwrap
+        self.probe = args.make_probe(seeds["probe"], action_space=space)  # condwrap
         self.update = 0
 
     @property
     def weights(self) -> Tensor:
-        return parameters_to_vector([*self.actor.parameters(), *self.critic.parameters()])
+        return nn.utils.parameters_to_vector([*self.actor.parameters(), *self.critic.parameters()])
 
     @property
     def parts(self) -> dict[str, Any]:
@@ -298,11 +294,10 @@ class Learner:
     def state_dict(self) -> dict[str, Any]:
         state: dict[str, Any] = {name: part.state_dict() for name, part in self.parts.items()}
         for name, rms in self.stats.items():
-            moments = vars(rms).items()
-            state[name] = {key: torch.tensor(x, dtype=torch.float64) for key, x in moments}
-
-        generators = {name: generator.get_state() for name, generator in self.generators.items()}
-        return {**state, "generators": generators, "update": self.update}
+            state[name] = {k: torch.tensor(x, dtype=torch.float64) for k, x in vars(rms).items()}
+        state["generators"] = {name: x.get_state() for name, x in self.generators.items()}
+        state["update"] = self.update
+        return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         for name, part in self.parts.items():
@@ -527,23 +522,18 @@ def open_logs(args: Args, saved: dict[str, Any] | None) -> SummaryWriter:
     return writer
 
 
-def make_row(
-    args: Args, learner: Learner, data: Rollout, losses: dict[str, float], speed: float
+def log_update(
+    args: Args, learner: Learner, writer: SummaryWriter, data: Rollout, numbers: dict[str, float]
 ) -> dict[str, float]:
-    """What is logged of an update."""
-    return {
+    """Write the update's row of metrics.csv, and the same as TensorBoard scalars."""
+    row = {
         "global_step": learner.update * args.batch_size,
         "charts/episodic_return": float(np.mean(data.returns or math.nan)),
         "charts/episodic_length": float(np.mean(data.lengths or math.nan)),
         "charts/episodes": len(data.returns),
-        "charts/SPS": speed,
-        **losses,
+        **numbers,
         **learner.probe.measure(learner.update, learner.actor, data.clean_obs),  # condwrap
     }
-
-
-def write_metrics(args: Args, writer: SummaryWriter, row: dict[str, float]) -> None:
-    """A row of metrics.csv for each update, and the same numbers as TensorBoard scalars."""
     with open(args.path / "metrics.csv", "a", newline="") as file:
         table = csv.DictWriter(file, row)
         if file.tell() == 0:
@@ -552,31 +542,29 @@ def write_metrics(args: Args, writer: SummaryWriter, row: dict[str, float]) -> N
 
     for name, value in row.items():
         if not math.isnan(value):
-            writer.add_scalar(name, value, int(row["global_step"]))
+            writer.add_scalar(name, value, row["global_step"])
+    return row
 
 
 def save_checkpoint(args: Args, learner: Learner) -> None:
     """Write a temporary file, then rename: a crash never leaves half a checkpoint."""
-    with open(args.path / "metrics.csv", "rb") as metrics:
-        os.fsync(metrics.fileno())
-        size = os.fstat(metrics.fileno()).st_size
-
-    settings = {k: v for k, v in vars(args).items() if k not in MAY_CHANGE}
-    content = {
-        "version": VERSION,
-        "args": settings,
-        "learner": learner.state_dict(),
-        "metrics_size": size,
-    }
     path = args.path / "checkpoint.pt"
-    with open(path.with_suffix(".tmp"), "wb") as file:
+    new = path.with_suffix(".tmp")
+    with open(args.path / "metrics.csv", "rb") as metrics, open(new, "wb") as file:
+        os.fsync(metrics.fileno())
+        content = {
+            "version": VERSION,
+            "args": {k: v for k, v in vars(args).items() if k not in MAY_CHANGE},
+            "learner": learner.state_dict(),
+            "metrics_size": os.fstat(metrics.fileno()).st_size,
+        }
         torch.save(content, file)
         file.flush()
         os.fsync(file.fileno())
 
     if path.exists():
         path.replace(path.with_suffix(".previous.pt"))
-    path.with_suffix(".tmp").replace(path)
+    new.replace(path)
 
 
 def load_checkpoint(args: Args) -> dict[str, Any] | None:
@@ -591,9 +579,9 @@ def load_checkpoint(args: Args) -> dict[str, Any] | None:
             saved = torch.load(candidate, map_location="cpu", weights_only=True)
         except Exception as error:  # a torn file can raise almost anything
             print(f"{candidate} cannot be read: {error!r}")
-            continue
-        check_same(args, saved)
-        return saved
+        else:
+            check_same(args, saved)
+            return saved
 
     if found:
         raise RunError(f"{args.path} holds no readable checkpoint: remove it to start again")
@@ -601,21 +589,19 @@ def load_checkpoint(args: Args) -> dict[str, Any] | None:
 
 
 def check_same(args: Args, saved: dict[str, Any]) -> None:
-    """Raise RunError unless the run was begun with these arguments, or can be extended to them."""
-    if (version := saved.get("version", 1)) != VERSION:
-        raise RunError(f"{args.path} was run by version {version} of this file, now {VERSION}")
-    longer = args.extend and args.total_timesteps > saved["args"]["total_timesteps"]
-    for name, value in saved["args"].items():
-        now = getattr(args, name, None)
-        if value != now and not (longer and name == "total_timesteps"):
-            raise RunError(f"{args.path} was run with {name}={value}, not {now}")
+    """Raise RunError unless the run was begun with these settings, or can be extended to them."""
+    now = {"VERSION": VERSION, **vars(args)}
+    begun = {"VERSION": saved.get("version", 1), **saved["args"]}
+    longer = args.extend and args.total_timesteps > begun["total_timesteps"]
+    for name, value in begun.items():
+        if value != now.get(name) and not (longer and name == "total_timesteps"):
+            raise RunError(f"{args.path} was run with {name}={value}, not {now.get(name)}")
 
-    update = saved["learner"]["update"]
-    if longer and update % args.checkpoint_interval:
-        raise RunError(
-            f"{args.path} cannot be extended: its {update} updates are not a multiple of "
-            f"checkpoint_interval={args.checkpoint_interval}, at which environments are rebuilt"
-        )
+    # a longer run would rebuild its environments at the next multiple, not here
+    updates = saved["learner"]["update"]
+    if longer and updates % args.checkpoint_interval:
+        of = f"not a multiple of checkpoint_interval={args.checkpoint_interval}"
+        raise RunError(f"{args.path} cannot be extended: its {updates} updates are {of}")
 
 
 # --- training -------------------------------------------------------------------------------------
@@ -661,8 +647,7 @@ def train(args: Args) -> Learner:
 
             now = time.monotonic()
             speed = (learner.update - first) * args.batch_size / (now - started)
-            row = make_row(args, learner, data, losses, speed)
-            write_metrics(args, writer, row)
+            row = log_update(args, learner, writer, data, {"charts/SPS": speed, **losses})
             if now - printed > 10 or learner.update == args.num_updates:
                 printed = now
                 print(f"update {learner.update}/{args.num_updates}  {speed:.0f} steps/s  "

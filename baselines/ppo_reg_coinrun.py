@@ -437,11 +437,9 @@ class Learner:
         # each use of randomness has its own stream
         names = ("init", "action", "minibatch", "dropout", "eval", "penalty", "probe")
         streams = np.random.SeedSequence((args.seed, args.agent)).spawn(len(names))
-        seeds = [int(stream.generate_state(1, np.uint64)[0]) for stream in streams]
-        self.generators = {
-            name: torch.Generator().manual_seed(seed)
-            for name, seed in zip(names[:5], seeds[:5], strict=True)
-        }
+        numbers = [int(stream.generate_state(1, np.uint64)[0]) for stream in streams]
+        seeds = dict(zip(names, numbers, strict=True))
+        self.generators = {x: torch.Generator().manual_seed(seeds[x]) for x in names[:5]}
 
         self.agent = Agent(args, self.generators["init"]).to(self.device)
         if on_gpu:
@@ -449,8 +447,8 @@ class Learner:
         self.optimizer = torch.optim.Adam(
             self.agent.parameters(), args.learning_rate, eps=1e-5, fused=True
         )
-        self.regularizer = args.make_regularizer(seeds[5], self.device)  # condwrap
-        self.probe = args.make_probe(seeds[6], self.device)  # condwrap
+        self.regularizer = args.make_regularizer(seeds["penalty"], self.device)  # condwrap
+        self.probe = args.make_probe(seeds["probe"], self.device)  # condwrap
         self.update = 0
         self.global_step = 0
 
@@ -494,9 +492,10 @@ class Learner:
 
     def state_dict(self) -> dict[str, Any]:
         state: dict[str, Any] = {name: part.state_dict() for name, part in self.parts.items()}
-        generators = {name: generator.get_state() for name, generator in self.generators.items()}
-        counters = {"update": self.update, "global_step": self.global_step}
-        return {**state, "generators": generators, **counters}
+        state["generators"] = {name: x.get_state() for name, x in self.generators.items()}
+        state["update"] = self.update
+        state["global_step"] = self.global_step
+        return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         for name, part in self.parts.items():
@@ -810,29 +809,20 @@ def open_logs(args: Args, saved: dict[str, Any] | None) -> SummaryWriter:
     return writer
 
 
-def make_row(
-    args: Args,
-    learner: Learner,
-    data: Rollout,
-    losses: dict[str, float],
-    speeds: dict[str, float],
+def log_update(
+    args: Args, learner: Learner, writer: SummaryWriter, data: Rollout, numbers: dict[str, float]
 ) -> dict[str, float]:
-    """What is logged of an update."""
-    return {
+    """Write the update's row of metrics.csv, and the same as TensorBoard scalars."""
+    row = {
         "global_step": learner.global_step,
         "charts/episodic_return": float(np.mean(data.returns or math.nan)),
         "charts/episodic_length": float(np.mean(data.lengths or math.nan)),
         "charts/success_rate": float(np.mean(data.successes or math.nan)),
         "charts/episodes": len(data.returns),
-        **speeds,
-        **losses,
+        **numbers,
         **evaluate(args, learner),
         **learner.probe.measure(learner.update, learner.agent.logprobs, data.states),  # condwrap
     }
-
-
-def write_metrics(args: Args, writer: SummaryWriter, row: dict[str, float]) -> None:
-    """A row of metrics.csv for each update, and the same numbers as TensorBoard scalars."""
     with open(args.path / "metrics.csv", "a", newline="") as file:
         table = csv.DictWriter(file, row)
         if file.tell() == 0:
@@ -841,31 +831,29 @@ def write_metrics(args: Args, writer: SummaryWriter, row: dict[str, float]) -> N
 
     for name, value in row.items():
         if not math.isnan(value):
-            writer.add_scalar(name, value, int(row["global_step"]))
+            writer.add_scalar(name, value, row["global_step"])
+    return row
 
 
 def save_checkpoint(args: Args, learner: Learner) -> None:
     """Write a temporary file, then rename: a crash never leaves half a checkpoint."""
-    with open(args.path / "metrics.csv", "rb") as metrics:
-        os.fsync(metrics.fileno())
-        size = os.fstat(metrics.fileno()).st_size
-
-    settings = {k: v for k, v in vars(args).items() if k not in MAY_CHANGE}
-    content = {
-        "version": VERSION,
-        "args": settings,
-        "learner": learner.state_dict(),
-        "metrics_size": size,
-    }
     path = args.path / "checkpoint.pt"
-    with open(path.with_suffix(".tmp"), "wb") as file:
+    new = path.with_suffix(".tmp")
+    with open(args.path / "metrics.csv", "rb") as metrics, open(new, "wb") as file:
+        os.fsync(metrics.fileno())
+        content = {
+            "version": VERSION,
+            "args": {k: v for k, v in vars(args).items() if k not in MAY_CHANGE},
+            "learner": learner.state_dict(),
+            "metrics_size": os.fstat(metrics.fileno()).st_size,
+        }
         torch.save(content, file)
         file.flush()
         os.fsync(file.fileno())
 
     if path.exists():
         path.replace(path.with_suffix(".previous.pt"))
-    path.with_suffix(".tmp").replace(path)
+    new.replace(path)
 
 
 def load_checkpoint(args: Args) -> dict[str, Any] | None:
@@ -880,9 +868,9 @@ def load_checkpoint(args: Args) -> dict[str, Any] | None:
             saved = torch.load(candidate, map_location="cpu", weights_only=True)
         except Exception as error:  # a torn file can raise almost anything
             print(f"{candidate} cannot be read: {error!r}")
-            continue
-        check_same(args, saved)
-        return saved
+        else:
+            check_same(args, saved)
+            return saved
 
     if found:
         raise RunError(f"{args.path} holds no readable checkpoint: remove it to start again")
@@ -890,21 +878,19 @@ def load_checkpoint(args: Args) -> dict[str, Any] | None:
 
 
 def check_same(args: Args, saved: dict[str, Any]) -> None:
-    """Raise RunError unless the run was begun with these arguments, or can be extended to them."""
-    if (version := saved.get("version", 1)) != VERSION:
-        raise RunError(f"{args.path} was run by version {version} of this file, now {VERSION}")
-    longer = args.extend and args.total_timesteps > saved["args"]["total_timesteps"]
-    for name, value in saved["args"].items():
-        now = getattr(args, name, None)
-        if value != now and not (longer and name == "total_timesteps"):
-            raise RunError(f"{args.path} was run with {name}={value}, not {now}")
+    """Raise RunError unless the run was begun with these settings, or can be extended to them."""
+    now = {"VERSION": VERSION, **vars(args)}
+    begun = {"VERSION": saved.get("version", 1), **saved["args"]}
+    longer = args.extend and args.total_timesteps > begun["total_timesteps"]
+    for name, value in begun.items():
+        if value != now.get(name) and not (longer and name == "total_timesteps"):
+            raise RunError(f"{args.path} was run with {name}={value}, not {now.get(name)}")
 
-    update = saved["learner"]["update"]
-    if longer and update % args.checkpoint_interval:
-        raise RunError(
-            f"{args.path} cannot be extended: its {update} updates are not a multiple of "
-            f"checkpoint_interval={args.checkpoint_interval}, at which environments are rebuilt"
-        )
+    # a longer run would rebuild its environments at the next multiple, not here
+    updates = saved["learner"]["update"]
+    if longer and updates % args.checkpoint_interval:
+        of = f"not a multiple of checkpoint_interval={args.checkpoint_interval}"
+        raise RunError(f"{args.path} cannot be extended: its {updates} updates are {of}")
 
 
 # --- training -------------------------------------------------------------------------------------
@@ -959,8 +945,7 @@ def train(args: Args) -> Learner:
                 "charts/SPS_transfer": steps / learner.uploading,
                 "charts/SPS_update": steps / (now - acted),
             }
-            row = make_row(args, learner, data, losses, speeds)
-            write_metrics(args, writer, row)
+            row = log_update(args, learner, writer, data, {**speeds, **losses})
             if now - printed > 10 or learner.update == args.num_updates:
                 printed = now
                 print(f"update {learner.update}/{args.num_updates}  {row['charts/SPS']:.0f} steps/s"

@@ -754,17 +754,17 @@ def test_every_row_measures_the_new_policy_on_the_rollouts_clean_observations(
 ):
     """psi of a row is that of the weights after the update, and noise does not enter it."""
     seen = []
-    kept = ppo_reg.make_row
+    kept = ppo_reg.log_update
 
-    def spy(args, learner, data, losses, speed):
+    def spy(args, learner, writer, data, numbers):
         probe = args.make_probe(0)
         probe.load_state_dict(learner.probe.state_dict())
         expected = probe.measure(learner.update, learner.actor, data.clean_obs)
-        row = kept(args, learner, data, losses, speed)
+        row = kept(args, learner, writer, data, numbers)
         seen.append((data, expected, row))
         return row
 
-    monkeypatch.setattr(ppo_reg, "make_row", spy)
+    monkeypatch.setattr(ppo_reg, "log_update", spy)
     train(pendulum(ppo_reg, tmp_path, perturb_obs=True, radius=0.5))
     assert len(seen) == 5
     for data, expected, row in seen:
@@ -810,14 +810,26 @@ def test_a_row_means_over_episodes_and_is_nan_without_one(tmp_path):
     learner.update = 3
     data = make_rollout([0.0], [0.0], [0.0], [0.0])
     data = data._replace(clean_obs=torch.randn(8, 3), returns=[1.0, 5.0], lengths=[2, 3])
-    row = ppo_reg.make_row(args, learner, data, {"losses/entropy": 0.5}, speed=7.0)
+    writer = ppo_reg.open_logs(args, None)
+    numbers = {"charts/SPS": 7.0, "losses/entropy": 0.5}
+    row = ppo_reg.log_update(args, learner, writer, data, numbers)
+    assert list(row)[:6] == [
+        "global_step",
+        "charts/episodic_return",
+        "charts/episodic_length",
+        "charts/episodes",
+        "charts/SPS",
+        "losses/entropy",
+    ]
+    assert read_metrics(tmp_path) == [{name: str(x) for name, x in row.items()}]
     assert row["global_step"] == 3 * 64
     assert row["charts/episodic_return"] == 3.0
     assert row["charts/episodic_length"] == 2.5
     assert row["charts/episodes"] == 2
     assert row["charts/SPS"] == 7.0
     assert row["losses/entropy"] == 0.5
-    empty = ppo_reg.make_row(args, learner, data._replace(returns=[], lengths=[]), {}, 7.0)
+    data = data._replace(returns=[], lengths=[])
+    empty = ppo_reg.log_update(args, learner, writer, data, numbers)
     assert math.isnan(empty["charts/episodic_return"])
     assert math.isnan(empty["charts/episodic_length"])
     assert empty["charts/episodes"] == 0
@@ -946,7 +958,7 @@ def test_a_run_of_another_version_is_not_continued(tmp_path, version, named):
     saved = torch.load(path, weights_only=True)
     assert saved.pop("version") == ppo_reg.VERSION
     torch.save(saved if version is None else {**saved, "version": version}, path)
-    message = f"run by version {named} of this file, now {ppo_reg.VERSION}$"
+    message = f"run with VERSION={named}, not {ppo_reg.VERSION}$"
     with pytest.raises(RunError, match=message):
         train(pendulum(ppo_reg, tmp_path, resume=True))
 

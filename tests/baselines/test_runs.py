@@ -326,7 +326,7 @@ def test_a_run_is_not_overwritten_by_another(baseline, tmp_path):
 def test_a_run_of_another_version_is_not_continued(baseline, tmp_path, monkeypatch):
     baseline.train(short_run(baseline, tmp_path))
     monkeypatch.setattr(baseline, "VERSION", 99)
-    with pytest.raises(baseline.RunError, match="was run by version 2 of this file, now 99"):
+    with pytest.raises(baseline.RunError, match="was run with VERSION=2, not 99"):
         baseline.train(short_run(baseline, tmp_path, resume=True))
 
 

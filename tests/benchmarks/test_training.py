@@ -76,9 +76,9 @@ def single_iteration(baseline, task, **settings):
     def iterate():
         data = baseline.rollout(args, learner, envs, state["obs"])
         learner.update += 1
-        losses = baseline.update(args, learner, data)
+        baseline.update(args, learner, data)
         state["obs"] = data.next_obs
-        baseline.make_row(args, learner, data, losses, 0.0)
+        learner.probe.measure(learner.update, learner.actor, data.clean_obs)
 
     with contextlib.closing(envs):
         yield iterate, args.batch_size
@@ -115,10 +115,10 @@ def population_iteration(algorithm, task, coefficient, agents):
     state = {"obs": envs.reset(seed=list(range(agents)))[0]}
 
     def iterate():
-        rollouts, losses = population.iterate(args, learners, envs, state["obs"], program.update)
+        rollouts, _ = population.iterate(args, learners, envs, state["obs"], program.update)
         state["obs"] = np.concatenate([data.next_obs for data in rollouts])
-        for each, learner, *row in zip(args.runs, learners, rollouts, losses, strict=True):
-            args.single.make_row(each, learner, *row, 0.0)
+        for learner, data in zip(learners, rollouts, strict=True):
+            learner.probe.measure(learner.update, learner.actor, data.clean_obs)
 
     with contextlib.closing(envs):
         yield iterate, agents * args.batch_size
