@@ -280,7 +280,7 @@ class Learner:
 
         self.regularizer = args.make_regularizer(seeds["penalty"])  # condwrap
         self.probe = args.make_probe(seeds["probe"], action_space=space)  # condwrap
-        self.update = 0
+        self.update = 0  # how many there have been
 
     @property
     def weights(self) -> Tensor:
@@ -405,7 +405,7 @@ def actor_loss(
     advantages: Tensor,
     delta: Tensor | None = None,  # condwrap
 ) -> tuple[Tensor, Tensor]:
-    """The policy's terms of equation (3), and what is logged of them."""
+    """The policy's terms of the loss that `update` minimizes, and what is logged of them."""
     actor = learner.actor
     policy = actor(obs)
     entropy = policy.entropy().mean()
@@ -442,6 +442,7 @@ def update(args: Args, learner: Learner, data: Rollout) -> dict[str, float]:
     its text says penalty. So -L_CLIP + c1·mean(psi) + c2·L_VF - c3·entropy is minimized here, the
     policy's terms and the critic's each by an optimizer of their own, since they share no weights.
     """
+    # step sizes fall linearly to 0
     if args.anneal_lr:
         left = 1 - (learner.update - 1) / args.num_updates
         learner.actor_optimizer.param_groups[0]["lr"] = left * args.learning_rate
@@ -486,8 +487,8 @@ def update(args: Args, learner: Learner, data: Rollout) -> dict[str, float]:
 
         # stop the policy once it has moved too far from the one that acted
         if policy_learns and args.target_kl is not None:
-            epoch_kl = torch.stack(policy_logs[-args.num_minibatches :])[:, 2].mean()
-            policy_learns = bool(epoch_kl <= args.target_kl)
+            _, _, kls, _ = torch.stack(policy_logs[-args.num_minibatches :]).unbind(1)
+            policy_learns = bool(kls.mean() <= args.target_kl)
 
     pg_loss, entropy, kl, clipfrac = torch.stack(policy_logs).mean(0).tolist()
     return {

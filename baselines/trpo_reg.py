@@ -276,7 +276,7 @@ class Learner:
 
         self.regularizer = args.make_regularizer(seeds["penalty"])  # condwrap
         self.probe = args.make_probe(seeds["probe"], action_space=space)  # condwrap
-        self.update = 0
+        self.update = 0  # how many there have been
 
     @property
     def weights(self) -> Tensor:
