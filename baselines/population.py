@@ -47,6 +47,10 @@ class PopulationArgs:
             raise ValueError(f"run_dir must hold {{agent}}, a folder for each, got {self.run_dir}")
         if getattr(self, "compile", False):
             raise ValueError(f"compile is for agents trained singly, by {self.single_file}")
+        if getattr(self, "penalty", "conditioning") != "conditioning":
+            raise ValueError(
+                f"penalty {self.penalty} is for agents trained singly, by {self.single_file}"
+            )
         if self.track:
             raise ValueError(f"track follows one run: train agents singly, by {self.single_file}")
 
@@ -409,6 +413,7 @@ def rollout(
     next_values = value(args, learners, by_agent(after)).masked_fill(by_agent(ends) == 1, 0)
     columns = {
         "obs": by_agent(obs),
+        "after": by_agent(after),
         "actions": actions,
         "rewards": by_agent(rewards),
         "dones": by_agent(dones),

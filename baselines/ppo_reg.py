@@ -36,7 +36,7 @@ from torch import Tensor, nn
 from torch.distributions import Independent, Normal
 from torch.utils.tensorboard import SummaryWriter
 
-from condwrap.settings import ConditioningArgs  # condwrap
+from condwrap.rivals import RivalArgs  # condwrap
 
 VERSION = 2  # raised whenever the numbers of a run change
 OBS_CLIP = 10.0  # bound of normalized observations
@@ -53,7 +53,7 @@ class DivergedError(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class Args(
-    ConditioningArgs,  # condwrap
+    RivalArgs,  # condwrap
 ):
     env_id: str = "HopperBulletEnv-v0"  # a Gymnasium task with a Box of actions, or "module:id"
     seed: int = 1  # seed of the run
@@ -278,7 +278,7 @@ class Learner:
         self.critic_optimizer = adam(self.critic.parameters(), args.vf_learning_rate)
         self.actor_loss = torch.compile(actor_loss) if args.compile else actor_loss
 
-        self.regularizer = args.make_regularizer(seeds["penalty"])  # condwrap
+        self.regularizer = args.make_penalty(seeds["penalty"])  # condwrap
         self.probe = args.make_probe(seeds["probe"], action_space=space)  # condwrap
         self.update = 0  # how many there have been
 
@@ -316,6 +316,7 @@ class Rollout(NamedTuple):
     """T steps of N environments, and what they led to."""
 
     obs: Tensor  # [T, N, obs_dim]
+    after: Tensor  # [T, N, obs_dim], what the step led to, which next_obs is not at an end
     actions: Tensor  # [T, N, action_dim], before they are clipped to the action space
     rewards: Tensor  # [T, N], scaled for learning
     dones: Tensor  # [T, N], 1 where an episode ended or was cut
@@ -368,6 +369,7 @@ def rollout(args: Args, learner: Learner, envs: VectorEnv, next_obs: np.ndarray)
     next_values = learner.critic(torch.from_numpy(after)).squeeze(-1)
     return Rollout(
         obs=torch.from_numpy(obs),
+        after=torch.from_numpy(after),
         actions=actions,
         rewards=torch.from_numpy(rewards),
         dones=torch.from_numpy(dones),
@@ -403,7 +405,7 @@ def actor_loss(
     actions: Tensor,
     old_logprobs: Tensor,
     advantages: Tensor,
-    delta: Tensor | None = None,  # condwrap
+    *drawn: Tensor,  # condwrap: what the penalty needs besides
 ) -> tuple[Tensor, Tensor]:
     """The policy's terms of the loss that `update` minimizes, and what is logged of them."""
     actor = learner.actor
@@ -419,8 +421,8 @@ def actor_loss(
 
     # -L_CLIP - c3 · entropy + c1 · mean(psi)
     loss = pg_loss - args.ent_coef * entropy
-    if delta is not None:  # condwrap
-        loss += learner.regularizer(actor, obs, delta=delta, output=policy).penalty  # condwrap
+    if drawn:  # condwrap
+        loss += args.penalize(learner, obs, actions, policy, drawn)  # condwrap
 
     # KL(old‖new) is estimated by E[ratio - 1 - log ratio]
     kl = (ratio - 1 - logratio).mean()
@@ -470,7 +472,7 @@ def update(args: Args, learner: Learner, data: Rollout) -> dict[str, float]:
         policy_learns = policy_learns and epoch < args.update_epochs
         columns = list(batch)
         if args.coefficient > 0 and policy_learns:  # condwrap
-            columns.append(learner.regularizer.sample_delta(obs))  # condwrap
+            columns += args.draw(learner, data)  # condwrap
 
         order = torch.randperm(len(obs), generator=learner.generators["minibatch"])
         for i in order.split(len(obs) // args.num_minibatches):

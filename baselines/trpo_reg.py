@@ -312,6 +312,7 @@ class Rollout(NamedTuple):
     """T steps of N environments, and what they led to."""
 
     obs: Tensor  # [T, N, obs_dim]
+    after: Tensor  # [T, N, obs_dim], what the step led to, which next_obs is not at an end
     actions: Tensor  # [T, N, action_dim], before they are clipped to the action space
     rewards: Tensor  # [T, N], scaled for learning
     dones: Tensor  # [T, N], 1 where an episode ended or was cut
@@ -364,6 +365,7 @@ def rollout(args: Args, learner: Learner, envs: VectorEnv, next_obs: np.ndarray)
     next_values = learner.critic(torch.from_numpy(after)).squeeze(-1)
     return Rollout(
         obs=torch.from_numpy(obs),
+        after=torch.from_numpy(after),
         actions=actions,
         rewards=torch.from_numpy(rewards),
         dones=torch.from_numpy(dones),

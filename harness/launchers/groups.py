@@ -53,7 +53,8 @@ def _begun_together(alike: list[RunSpec], store: Store) -> list[Group]:
 
 def _is_alone(spec: RunSpec) -> bool:
     """Whether no population can train it."""
-    return spec.args.get("compile", False) or not has_population(spec.baseline)
+    rival = spec.args.get("penalty", "conditioning") != "conditioning"
+    return rival or spec.args.get("compile", False) or not has_population(spec.baseline)
 
 
 def _chunks(specs: list[RunSpec], size: int) -> list[Group]:

@@ -540,6 +540,7 @@ def test_a_killed_process_continues_as_if_undisturbed(tmp_path):
         (["--num-agents", "0"], "num_agents must be at least 1, got 0"),
         (["--run-dir", "results"], "run_dir must hold {agent}, a folder for each, got results"),
         (["--compile"], "compile is for agents trained singly, by ppo_reg.py"),
+        (["--penalty", "sa"], "penalty sa is for agents trained singly, by ppo_reg.py"),
         (["--track"], "track follows one run: train agents singly, by ppo_reg.py"),
         (["--gamma", "1.5"], "gamma must be in [0, 1], got 1.5"),
         (["--coefficient", "-1"], "coefficient must be finite and at least 0, got -1.0"),

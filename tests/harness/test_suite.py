@@ -257,6 +257,7 @@ SUITES_OF_LEVELS = ("smoke_coinrun", "table2", "themes")
 
 def test_the_shipped_suites_are_those_of_the_study():
     control = ["ablation", "ablation_delta", "figure1", "first", "smoke", "strong", "table1"]
+    control += ["rivals", "rivals_search"]
     assert suite_names() == sorted([*control, *SUITES_OF_LEVELS, "figure4", "paper"])
 
 
@@ -509,7 +510,9 @@ def test_an_unknown_suite_is_not_included(tmp_path):
         load_suite(including(tmp_path, []))
 
 
-@pytest.mark.parametrize("name", ["ablation", "ablation_delta", "figure1", "strong", "table1"])
+@pytest.mark.parametrize(
+    "name", ["ablation", "ablation_delta", "figure1", "rivals", "rivals_search", "strong", "table1"]
+)
 def test_every_control_agent_is_evaluated_over_20_episodes(name):
     assert all(run.evaluation == {"episodes": 20} for run in load_suite(name).runs)
 
@@ -576,3 +579,21 @@ def test_smoke_holds_the_eight_agents_of_coinrun():
     assert runs == load_suite("smoke_coinrun").runs
     assert {run.suite for run in runs} == {"smoke_coinrun"}
     assert [run.algorithm for run in runs] == load_suite("table2").algorithms
+
+
+def test_every_rival_is_compared_and_has_the_same_search():
+    compared = {
+        run.args.get("penalty", "conditioning"): run.args["coefficient"]
+        for run in load_suite("rivals").runs
+        if run.args["coefficient"] > 0
+    }
+    assert compared.keys() == {"conditioning", "jacobian", "caps", "lcp", "l2c2", "sa", "spectral"}
+    searched: dict[str, set[float]] = {}
+    for run in load_suite("rivals_search").runs:
+        name = run.args.get("penalty", "conditioning")
+        searched.setdefault(name, set()).add(run.args["coefficient"])
+    assert searched.keys() == compared.keys()
+    for name, coefficients in searched.items():
+        low, middle, high = sorted(coefficients)
+        assert (low * 10, middle * 10) == pytest.approx((middle, high))
+        assert compared[name] in coefficients

@@ -108,3 +108,11 @@ def test_the_command_of_a_group_and_of_one(store):
     assert "--num-agents" not in alone
     assert judge[4:] == [str(store.path(runs[0]).resolve()), "--episodes", "20"]
     assert len(commands([dataclasses.replace(run, evaluation={}) for run in runs], store)) == 1
+
+
+def test_agents_with_a_rival_of_the_penalty_are_alone(store):
+    runs = load_suite("rivals", env=("Hopper",)).runs
+    rivals = [run for run in runs if run.algorithm == "CAPS"]
+    assert [len(group) for group in make_groups(rivals, store, jobs=1)] == [1] * 5
+    conditioning = [run for run in runs if run.algorithm == "conditioning"]
+    assert [len(group) for group in make_groups(conditioning, store, jobs=1)] == [5]
