@@ -74,7 +74,7 @@ def make_rollout(rewards, values, next_values, dones) -> Rollout:
     values, next_values = (
         torch.tensor(x, dtype=torch.float32)[:, None] for x in (values, next_values)
     )
-    return Rollout(None, None, *columns, values, next_values, None, [], [], None)
+    return Rollout(None, None, None, *columns, values, next_values, None, [], [], None)
 
 
 # --- mathematics ---------------------------------------------------------------------------------
@@ -196,7 +196,7 @@ def test_one_update_by_hand():
     next_values = torch.tensor([3.0, 6.0, 0.0, 7.0])
     dones = torch.tensor([0.0, 0.0, 1.0, 0.0])
     columns = [x[:, None] for x in (rewards, dones, values, next_values)]
-    data = Rollout(obs[:, None, None], actions[:, None, None], *columns, None, [], [], None)
+    data = Rollout(obs[:, None, None], None, actions[:, None, None], *columns, None, [], [], None)
 
     learner.update = 1
     logs = ppo_reg.update(args, learner, data)
@@ -240,7 +240,7 @@ def test_gradients_are_clipped_to_the_given_length():
     columns = [torch.tensor(x)[:, None] for x in ([9.0, 0.0, -9.0, 5.0], [0.0] * 4)]
     obs = torch.tensor([0.0, 1.0, 2.0, -1.0])[:, None]
     data = Rollout(
-        obs[..., None], 2 * obs[..., None] + 3, *columns, 3 * obs, obs, None, [], [], None
+        obs[..., None], None, 2 * obs[..., None] + 3, *columns, 3 * obs, obs, None, [], [], None
     )
     before = [3.0, 2.0, 0.5]
     ppo_reg.update(args, learner, data)
@@ -287,7 +287,17 @@ def test_every_epoch_takes_each_state_once(
     learner.regularizer.sample_delta = lambda x: deltas.append(len(x)) or sample_delta(x)
     obs = torch.arange(16.0)[:, None]
     data = Rollout(
-        obs[..., None], obs[..., None] + 0.5, obs, 0 * obs, 0 * obs, 0 * obs, None, [], [], None
+        obs[..., None],
+        None,
+        obs[..., None] + 0.5,
+        obs,
+        0 * obs,
+        0 * obs,
+        0 * obs,
+        None,
+        [],
+        [],
+        None,
     )
     logs = ppo_reg.update(args, learner, data)
     # what is logged is a mean over the minibatches: log-std begins at 0.5 and moves by little

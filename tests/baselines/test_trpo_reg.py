@@ -463,6 +463,7 @@ def small_rollout() -> trpo_reg.Rollout:
     }
     return trpo_reg.Rollout(
         obs=obs[..., None],
+        after=None,
         actions=torch.tensor([0.5, 1.0, 6.0, -1.0])[:, None, None],
         values=3 * obs,
         next_obs=None,

@@ -119,14 +119,17 @@ def test_a_single_run_ends_as_if_it_had_been_that_long(baseline, tmp_path):
 
 @pytest.mark.parametrize("baseline", [ppo_reg, trpo_reg, ppo_reg_coinrun])
 def test_a_baseline_grows_only_when_told_to_and_never_shrinks(baseline, tmp_path):
-    baseline.train(short_run(baseline, tmp_path, total_timesteps=128))
-    more = short_run(baseline, tmp_path, total_timesteps=256, resume=True)
+    own = {"anneal": False} if baseline is ppo_reg_coinrun else {}
+    baseline.train(short_run(baseline, tmp_path, total_timesteps=128, **own))
+    again = {"resume": True, **own}
+    more = short_run(baseline, tmp_path, total_timesteps=256, **again)
     with pytest.raises(baseline.RunError, match="total_timesteps=128, not 256"):
         baseline.train(more)
-    less = short_run(baseline, tmp_path, total_timesteps=64, resume=True, extend=True)
+    again["extend"] = True
+    less = short_run(baseline, tmp_path, total_timesteps=64, **again)
     with pytest.raises(baseline.RunError, match="total_timesteps=128, not 64"):
         baseline.train(less)
-    other = short_run(baseline, tmp_path, total_timesteps=256, resume=True, extend=True, gamma=0.5)
+    other = short_run(baseline, tmp_path, total_timesteps=256, gamma=0.5, **again)
     with pytest.raises(baseline.RunError, match="gamma"):
         baseline.train(other)
 
