@@ -367,6 +367,7 @@ def test_the_defaults_are_the_standard_setting():
     settings = dataclasses.asdict(Args())
     conditioning = {"coefficient", "lambda_min", "lambda_max", "reduction", "perturbation"}
     conditioning |= {"radius", "printed_sign", "probe_fraction", "log_spectrum", "perturb_obs"}
+    conditioning |= {"penalty"}
     assert {k: v for k, v in settings.items() if k not in conditioning} == STANDARD
     assert conditioning <= settings.keys()
 
