@@ -125,7 +125,12 @@ def test_without_runs_there_are_the_papers_numbers(store):
 
 
 @pytest.mark.parametrize(
-    ("unseen", "words"), [("next", "the levels that follow"), ("unbounded", "drawn without bound")]
+    ("unseen", "words"),
+    [
+        ("next", "Ours are the levels that follow the training set, with the themes"),
+        ("unbounded", "Ours are levels drawn without bound, with the themes"),
+        ("themes", "Ours are the levels that follow the training set, with the themes"),
+    ],
 )
 def test_what_the_unseen_levels_are_is_said(tmp_path, unseen, words):
     results = games_of(tmp_path, ["PPO"], {"CoinRun": "coinrun"})
@@ -134,10 +139,11 @@ def test_what_the_unseen_levels_are_is_said(tmp_path, unseen, words):
         for run in results.suite.runs
     ]
     suite = dataclasses.replace(results.suite, runs=runs)
-    said = notes(dataclasses.replace(results, suite=suite), make_cells(results))[-1]
-    assert words in said
-    assert "difficulty 3 only" in said
-    assert "not of the same test" in said
+    said = notes(dataclasses.replace(results, suite=suite), make_cells(results))
+    note = next(line for line in said if line.startswith("The paper's unseen levels are new in"))
+    assert words in note
+    assert "other levels, themes that training never showed, and difficulty 3 only, where" in note
+    assert note.endswith("So the two unseen columns are not of the same test.")
 
 
 def test_rows_are_agents_and_columns_kinds_of_levels_beside_the_paper(results, cells):
@@ -159,6 +165,16 @@ def test_markdown_has_the_table_and_the_notes(results, cells):
     assert [line for line in lines if line.startswith("- ")][-1].endswith("not of the same test.")
 
 
+def test_an_agent_has_no_row_in_a_game_that_it_is_not_planned_for(tmp_path):
+    results = games_of(tmp_path, ["PPO", "PPO reg"], {"CoinRun": "coinrun", "Maze": "maze"})
+    runs = [run for run in results.suite.runs if (run.environment, run.algorithm) != ("Maze", "PPO")]
+    results = dataclasses.replace(results, suite=dataclasses.replace(results.suite, runs=runs))
+    cells = make_cells(results)
+    assert len(cells) == 3 * 2 * 2  # agents, kinds of levels, kinds of actions
+    _, rows = to_rows(results, cells)
+    assert [row[0] for row in rows] == ["CoinRun: PPO", "CoinRun: PPO reg", "Maze: PPO reg"]
+
+
 def test_the_frame_has_a_row_for_each_cell(cells):
     frame = to_frame(list(cells.values()))
     assert len(frame) == 8 * 4
@@ -175,6 +191,14 @@ def test_the_terminal_shows_an_agent_to_a_line(results, cells):
     assert "75.0 [" in line
     assert "100.0 [100.0, 100.0]" in text
     assert "32.8" in text
+
+
+def test_the_terminal_sets_numbers_to_the_right_and_what_they_rest_on_below(results, cells):
+    table = to_rich(results, list(cells.values()))
+    assert [column.justify for column in table.columns] == ["left", *["right"] * 6]
+    assert table.title == "table2: success rate on CoinRun levels, %"
+    first = [next(iter(column.cells)) for column in table.columns]
+    assert first[:3] == ["PPO", "100.0 \\[100.0, 100.0]\n(n 1, 0 failed, finds –)", "55.0"]
 
 
 def test_a_cell_of_five_runs_says_what_it_could_have_found(store):
@@ -241,5 +265,10 @@ def test_themes_are_a_third_kind_of_levels_without_a_number_of_the_papers(themed
 
 
 def test_what_the_themes_are_is_said_where_there_are_any(themed, results):
-    assert notes(themed, make_cells(themed)).count(THEMES) == 1
+    said = notes(themed, make_cells(themed))
+    assert said.count(THEMES) == 1
     assert THEMES not in notes(results, make_cells(results))
+    assert THEMES.startswith("These agents trained with one theme each of the player, the ground, ")
+    assert "the enemies. Themes are the unseen levels once more, in all themes: nearest to" in THEMES
+    assert "the paper's unseen levels, which have other themes than training throughout" in THEMES
+    assert THEMES.endswith("are unbounded in number, and are all of difficulty 3.")
