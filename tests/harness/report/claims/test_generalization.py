@@ -6,12 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from harness.report.claims import generalization_claim
+from harness.report.claims import generalization, generalization_claim
 from harness.report.results import load_results
 from harness.schema import SUITES
 from harness.statistics import compare_success
 from harness.suite import load_suite
 from tests.harness.conftest import make_episodes, write_run
+from tests.harness.report.conftest import make_games
 
 PLAIN = [[1, 0], [0, 0]]  # 1/4
 BETTER, WORSE = [[1, 1], [0, 0]], [[0, 0], [0, 0]]  # 1/2, 0
@@ -65,6 +66,9 @@ def gain(seed: int) -> int:
 def test_the_verdict_is_where_all_gains_are(store, reg, expected, gains):
     claim = claim_of(store, reg)
     assert (claim.letter, claim.verdict) == ("d", expected)
+    assert claim.statement == (
+        "The regularizer improves all four CoinRun agents, on seen and on unseen levels."
+    )
     assert len(claim.findings) == 4 * 2  # pairs of agents, seen and unseen
     assert [f.estimate.mean for f in claim.findings] == pytest.approx([*gains] * 4)
     assert {f.estimate.n for f in claim.findings} == {10}
@@ -94,7 +98,9 @@ def test_below_five_training_runs_the_verdict_says_how_many(store, seeds, word):
 
 
 def test_five_training_runs_have_a_verdict(store):
-    assert claim_of(store, lambda seed: 3 + seed % 2, seeds=5).verdict == "supported"
+    claim = claim_of(store, lambda seed: 3 + seed % 2, seeds=5)
+    assert claim.verdict == "supported"
+    assert {f.note for f in claim.findings} == {"interval over training runs and levels"}
 
 
 def test_five_equal_gains_decide_nothing(store):
@@ -102,6 +108,18 @@ def test_five_equal_gains_decide_nothing(store):
     claim = claim_of(store, lambda _: 4, seeds=5)
     assert claim.verdict == "undecided"
     assert {f.p for f in claim.findings} == {2 / 32}
+
+
+@pytest.mark.parametrize(("corrected", "word"), [(0.05, "supported"), (0.0501, "undecided")])
+def test_a_corrected_p_of_5_percent_is_enough(store, monkeypatch, corrected, word):
+    monkeypatch.setattr(generalization, "holm", lambda p: np.full_like(p, corrected))
+    assert claim_of(store, gain, seeds=5).verdict == word
+
+
+def test_without_a_regularized_agent_there_is_nothing_to_say(tmp_path):
+    results = make_games(tmp_path, lambda *_: episodes(PLAIN, PLAIN), ["PPO"], {"Maze": "maze"})
+    claim = generalization_claim(results)
+    assert (claim.verdict, claim.findings) == ("undecided", [])
 
 
 def test_the_pair_with_the_fewest_runs_speaks_for_all(store):
