@@ -16,13 +16,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from baselines.ppo_reg_coinrun import Agent, Args, make_env
+from baselines.ppo_reg_coinrun import Agent, Args, RunError, make_env
 from harness.evaluation import levels as module
-from harness.evaluation.checkpoint import read_checkpoint
+from harness.evaluation.checkpoint import Checkpoint, read_checkpoint
 from harness.evaluation.levels import (
     COLUMNS,
     Levels,
     choose_levels,
+    evaluate,
     evaluate_levels,
     load_agent,
     record,
@@ -74,6 +75,16 @@ def test_unbounded_levels_are_drawn_again_where_they_were_trained_on(monkeypatch
     assert set(unseen) <= set(range(5)) | set(range(15, 30))
 
 
+def test_by_default_every_agent_meets_the_same_unbounded_levels():
+    first = choose_levels(Args(), 3, "unbounded")["unseen"]
+    assert first == choose_levels(Args(coefficient=0.0), 3, "unbounded", seed=0)["unseen"]
+    assert first == [176863850, 47463564, 1815655339]
+
+
+def test_a_level_is_a_seed_that_the_engine_takes():
+    assert np.iinfo(np.int32).max == module.MAX_SEED
+
+
 def test_the_unbounded_draw_is_set_by_its_seed():
     unseen = [choose_levels(ARGS, 5, "unbounded", seed)["unseen"] for seed in (0, 0, 1)]
     assert unseen[0] == unseen[1] != unseen[2]
@@ -100,16 +111,18 @@ def test_levels_that_cannot_be_had_are_refused(changed, count, unseen, message):
 class OneLevel:
     """An engine of our own: level L's episodes last L, L + 1, ... steps; even levels are won."""
 
+    made: list[OneLevel] = []
     single_observation_space = gym.spaces.Box(0, 255, (3, 64, 64), np.uint8)
     single_action_space = gym.spaces.Discrete(15)
 
     def __init__(self, args: Args, num_envs: int, level: int) -> None:
-        assert args.num_levels == 1
+        self.args = args
         self.metadata: dict = {}
         self.level, self.num_envs, self.closed = level, num_envs, False
+        OneLevel.made.append(self)
 
-    def reset(self, seed: int) -> tuple:
-        self.steps, self.actions = 0, []
+    def reset(self, seed: int | None = None) -> tuple:
+        self.seed, self.steps, self.actions = seed, 0, []
         return self.frames(), {}
 
     def frames(self) -> np.ndarray:
@@ -118,6 +131,7 @@ class OneLevel:
         return frames
 
     def step_async(self, actions: np.ndarray) -> None:
+        assert actions.shape == (self.num_envs,)
         self.actions.append(actions)
         self.steps += 1
 
@@ -137,8 +151,11 @@ class OneLevel:
 
 
 @pytest.fixture
-def own_engine(monkeypatch):
+def own_engine(monkeypatch) -> list[OneLevel]:
+    """Puts it in the engine's place, and gives all that were made."""
+    monkeypatch.setattr(OneLevel, "made", [])
     monkeypatch.setattr(module, "make_env", OneLevel)
+    return OneLevel.made
 
 
 @pytest.fixture
@@ -169,6 +186,23 @@ def test_frames_and_infos_are_in_the_order_of_the_levels():
     assert info["success"][[3, 4]].tolist() == [1, 0]
     env.close()
     assert all(e.closed for e in env.envs)
+
+
+def test_a_pool_holds_one_level_and_takes_one_thread(own_engine):
+    Levels(ARGS, [4, 2], repeats=3)
+    assert [(e.level, e.num_envs) for e in own_engine] == [(4, 3), (2, 3)]
+    assert {(e.args.num_levels, e.args.num_threads) for e in own_engine} == {(1, 1)}
+
+
+def test_the_seed_of_a_reset_gives_each_pool_one_that_the_engine_takes(own_engine):
+    seeds = []
+    for seed in (0, 0, 1):
+        own_engine.clear()
+        Levels(ARGS, list(range(1, 33)), repeats=1).reset(seed=seed)
+        seeds.append([e.seed for e in own_engine])
+    assert seeds[0] == seeds[1]
+    assert len({*seeds[0], *seeds[2]}) == 2 * 32
+    assert 10**9 < max(seeds[0]) < 2**31
 
 
 def test_the_engine_shows_each_level_in_its_place():
@@ -204,21 +238,47 @@ def test_each_level_has_its_repeats_and_a_greedy_episode_and_only_first_ones_cou
         assert set(both["return"]) == {10.0 * (level % 2 == 0)}
 
 
-@pytest.mark.usefixtures("own_engine")
-def test_sampled_actions_differ_and_greedy_ones_are_the_likeliest(agent, monkeypatch):
-    chosen = []
+def test_sixteen_levels_are_played_at_a_time(own_engine, agent):
+    parts = list(evaluate_levels(agent, ARGS, list(range(1, 18)), repeats=1))
+    assert [len(part) for part in parts] == [16, 16, 1, 1]  # sampled, greedy
+    assert len(own_engine) == 2 * 17
+    assert all(engine.closed for engine in own_engine)
+
+
+@pytest.fixture
+def chosen(own_engine, monkeypatch) -> list[list[int]]:
+    """The actions of each step of each level, in the order in which they are taken."""
+    taken = []
     step_async = OneLevel.step_async
     monkeypatch.setattr(
-        OneLevel, "step_async", lambda e, a: (chosen.append(np.array(a)), step_async(e, a))
+        OneLevel, "step_async", lambda e, a: (taken.append(a.tolist()), step_async(e, a))
     )
+    return taken
+
+
+def test_sampled_actions_differ_and_greedy_ones_are_the_likeliest(agent, chosen):
     list(evaluate_levels(agent, ARGS, [3], repeats=20))
     sampled, greedy = chosen[0], chosen[-3]  # its episode has 3 steps
-    assert len(set(sampled.tolist())) > 5  # an agent that knows nothing: 15 actions alike
+    assert len(set(sampled)) > 5  # an agent that knows nothing: 15 actions alike
     frames = torch.tensor(Levels(ARGS, [3], 1).reset(seed=0)[0])
-    assert greedy.tolist() == agent.eval()(frames)[0].argmax(-1).tolist()
-    again = len(chosen)
-    list(evaluate_levels(agent, ARGS, [3], repeats=20))
-    np.testing.assert_array_equal(np.concatenate(chosen[:again]), np.concatenate(chosen[again:]))
+    assert greedy == agent.eval()(frames)[0].argmax(-1).tolist()
+
+
+def test_sampled_actions_are_set_by_the_seed_and_the_place_of_a_levels_pool(
+    agent, chosen, monkeypatch
+):
+    monkeypatch.setattr(module, "POOLS", 2)
+
+    def play(levels: list[int], **seed: int) -> list[list[int]]:
+        chosen.clear()
+        list(evaluate_levels(agent, ARGS, levels, repeats=20, **seed))
+        return list(chosen)
+
+    alone = play([3, 2], seed=7)
+    assert alone == play([3, 2], seed=7)
+    assert alone != play([3, 2], seed=8)
+    assert alone == play([4, 1, 3, 2], seed=5)[-len(alone) :]  # the levels from the third on
+    assert play([3]) == play([3], seed=0)
 
 
 @pytest.mark.usefixtures("own_engine")
@@ -257,6 +317,97 @@ def test_a_gif_ends_with_the_episode_or_at_its_longest(agent, monkeypatch, tmp_p
     record(agent, ARGS, level, tmp_path / "seen.gif")
     with Image.open(tmp_path / "seen.gif") as picture:
         assert (picture.format, picture.size, picture.n_frames) == ("GIF", (256, 256), frames)
+        assert picture.info["loop"] == 0  # for ever
+        assert picture.info["duration"] == 60  # ms: 15 frames a second, in a GIF's steps of 10 ms
+
+
+def test_by_default_a_gif_has_300_frames_at_most():
+    assert module.GIF_FRAMES == 300
+
+
+def test_a_gif_shows_what_the_agent_saw_and_the_engine_is_closed(own_engine, agent, tmp_path):
+    """Red tells the level; the square that blinks in the corner is 8 pixels wide, here 32."""
+    record(agent, ARGS, 200, tmp_path / "seen.gif")
+    with Image.open(tmp_path / "seen.gif") as picture:
+        shown = []
+        for frame in range(3):
+            picture.seek(frame)
+            shown.append(np.asarray(picture.convert("RGB")))
+    assert {tuple(image[255, 255]) for image in shown} == {(200, 0, 0)}
+    assert [image[31, 31, 1] for image in shown] == [0, 80, 160]
+    assert [(image[..., 1] > 0).sum() for image in shown] == [0, 32 * 32, 32 * 32]
+    assert [(e.level, e.num_envs, e.closed) for e in own_engine] == [(200, 1, True)]
+    first = torch.zeros(1, 3, 64, 64, dtype=torch.uint8)
+    first[:, 0] = 200
+    assert own_engine[0].actions[0] == agent.eval()(first)[0].argmax()
+
+
+# --- a checkpoint ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def checkpoint(agent, tmp_path) -> Checkpoint:
+    """An agent that was trained on the levels 5 to 14."""
+    learner = {"agent": agent.state_dict()}
+    return Checkpoint(tmp_path, "ppo_reg_coinrun", ARGS, learner, sha256="")
+
+
+def test_both_kinds_of_levels_are_played_in_order(own_engine, checkpoint, monkeypatch):
+    monkeypatch.setattr(module, "POOLS", 2)
+    counts = []
+
+    def show(parts, total):
+        parts = list(parts)
+        counts.append((len(parts), total))
+        return reversed(parts)  # whatever their order
+
+    episodes = evaluate(checkpoint, 3, 2, "next", "cpu", show)
+    assert counts == [(2 * 2 * 2, 2 * 2 * 2)]  # kinds of levels, pools, kinds of actions
+    places = [("greedy", 0), ("sampled", 0), ("sampled", 1)]
+    expected = [
+        (split, level, *place)
+        for split, levels in {"seen": (5, 8, 11), "unseen": (15, 18, 21)}.items()
+        for level in levels
+        for place in places
+    ]
+    assert list(map(tuple, episodes[COLUMNS[:4]].to_numpy())) == expected
+    assert episodes.index.tolist() == list(range(18))
+    assert episodes["success"].dtype == int
+    assert sorted(path.name for path in checkpoint.path.glob("*.gif")) == ["seen.gif", "unseen.gif"]
+    assert [e.level for e in own_engine[-2:]] == [5, 15]  # of the GIFs
+    assert all(engine.closed for engine in own_engine)
+
+
+def test_the_engine_is_tried_with_one_environment_before_all_others(own_engine, checkpoint):
+    evaluate(checkpoint, 1, 1, "next", "cpu")
+    first = own_engine[0]
+    assert (first.level, first.num_envs, first.args.num_levels) == (5, 1, 10)
+
+
+def test_an_engine_that_does_not_start_is_told(own_engine, checkpoint, monkeypatch):
+    def fail(self, seed=None):
+        raise RunError("no engine here")
+
+    monkeypatch.setattr(OneLevel, "reset", fail)
+    with pytest.raises(EvaluationError, match="no engine here"):
+        evaluate(checkpoint, 1, 1, "next", "cpu")
+    assert len(own_engine) == 1
+
+
+def test_weights_that_do_not_fit_are_refused(checkpoint):
+    with pytest.raises(EvaluationError, match="holds weights that today's ppo_reg_coinrun does"):
+        load_agent(dataclasses.replace(checkpoint, learner={"agent": {}}), "cpu")
+    with pytest.raises(EvaluationError, match="holds weights that today's ppo_reg_coinrun does"):
+        load_agent(dataclasses.replace(checkpoint, learner={}), "cpu")
+
+
+def test_an_agent_is_loaded_to_the_device_that_was_asked_for(checkpoint):
+    elsewhere = dataclasses.replace(checkpoint.args, device="cuda:99")
+    agent, args = load_agent(dataclasses.replace(checkpoint, args=elsewhere), "cpu")
+    assert args == dataclasses.replace(ARGS, device="cpu")
+    assert agent.device.type == "cpu"
+    with pytest.raises(EvaluationError, match="device cuda:99 cannot be used"):
+        load_agent(checkpoint, "cuda:99")
 
 
 # --- a run ----------------------------------------------------------------------------------------

@@ -167,7 +167,9 @@ def test_markdown_has_the_table_and_the_notes(results, cells):
 
 def test_an_agent_has_no_row_in_a_game_that_it_is_not_planned_for(tmp_path):
     results = games_of(tmp_path, ["PPO", "PPO reg"], {"CoinRun": "coinrun", "Maze": "maze"})
-    runs = [run for run in results.suite.runs if (run.environment, run.algorithm) != ("Maze", "PPO")]
+    runs = [
+        run for run in results.suite.runs if (run.environment, run.algorithm) != ("Maze", "PPO")
+    ]
     results = dataclasses.replace(results, suite=dataclasses.replace(results.suite, runs=runs))
     cells = make_cells(results)
     assert len(cells) == 3 * 2 * 2  # agents, kinds of levels, kinds of actions
@@ -269,6 +271,8 @@ def test_what_the_themes_are_is_said_where_there_are_any(themed, results):
     assert said.count(THEMES) == 1
     assert THEMES not in notes(results, make_cells(results))
     assert THEMES.startswith("These agents trained with one theme each of the player, the ground, ")
-    assert "the enemies. Themes are the unseen levels once more, in all themes: nearest to" in THEMES
+    assert (
+        "the enemies. Themes are the unseen levels once more, in all themes: nearest to" in THEMES
+    )
     assert "the paper's unseen levels, which have other themes than training throughout" in THEMES
     assert THEMES.endswith("are unbounded in number, and are all of difficulty 3.")
