@@ -6,6 +6,7 @@ import dataclasses
 import json
 import shutil
 from pathlib import Path
+from typing import ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -111,7 +112,7 @@ def test_levels_that_cannot_be_had_are_refused(changed, count, unseen, message):
 class OneLevel:
     """An engine of our own: level L's episodes last L, L + 1, ... steps; even levels are won."""
 
-    made: list[OneLevel] = []
+    made: ClassVar[list[OneLevel]] = []
     single_observation_space = gym.spaces.Box(0, 255, (3, 64, 64), np.uint8)
     single_action_space = gym.spaces.Discrete(15)
 

@@ -66,7 +66,8 @@ def test_a_cell_is_the_success_rate_over_levels(cells):
     assert cells["PPO reg", "unseen", "sampled"].estimate.mean == 0.25
     assert cells["PPO reg", "unseen", "greedy"].estimate.mean == 0.5
     assert (cell.estimate.n, cell.planned, cell.levels, cell.repeats) == (1, 1, 2, 2)
-    assert cells["PPO reg", "seen", "greedy"].repeats == 1
+    greedy = cells["PPO reg", "seen", "greedy"]
+    assert (greedy.levels, greedy.repeats) == (2, 1)
     assert (cell.steps, cells["PPO", "seen", "sampled"].steps) == (400, 300)
 
 
@@ -79,8 +80,24 @@ def test_a_cell_says_percent_with_its_interval(cells):
 
 def test_an_agent_that_is_not_done_has_no_cell_yet(cells):
     assert cells["PPO-l2", "seen", "sampled"].text == "–"
-    assert cells["PPO-l2", "seen", "sampled"].levels == 0
-    assert cells["PPO-l2", "seen", "sampled"].steps == 900
+    learning, waiting = cells["PPO-l2", "seen", "sampled"], cells["PPO-D", "seen", "sampled"]
+    assert (learning.levels, learning.repeats, learning.steps) == (0, 0, 900)
+    assert (waiting.levels, waiting.repeats, waiting.steps) == (0, 0, 0)
+
+
+def test_a_cell_is_as_long_as_its_shortest_run_and_the_notes_name_the_fullest_cell(store):
+    """PPO has runs of 3, 2 and 4 updates of 100 steps, PPO reg one of 5."""
+    suite = load_suite("table2", seeds=3)
+    updates = {("PPO", 1): 3, ("PPO", 2): 2, ("PPO", 3): 4, ("PPO reg", 1): 5}
+    for run in suite.runs:
+        if length := updates.get((run.algorithm, run.args["seed"])):
+            write_run(store, run, [1.0] * length, episodes=episodes())
+    results = load_results(suite, store)
+    cells = make_cells(results)
+    assert {c.steps for c in cells if c.algorithm == "PPO"} == {200}
+    said = notes(results, cells)
+    assert "at most 3; the paper has 1" in said[1]
+    assert said[2].startswith("Steps done: 200;")
 
 
 def test_the_papers_numbers_stand_beside_the_sampled_actions(results, cells):
@@ -96,13 +113,30 @@ def test_the_notes_say_what_the_cells_rest_on(results, cells):
     said = notes(results, list(cells.values()))
     assert said[0].startswith("2 seen and 2 unseen levels, 2 repeats")
     assert said[0].endswith("The paper: 500 training levels, 20 repeats.")
-    assert "at most 1; the paper has 1" in said[1]
-    assert "from 5 runs on over training runs and levels" in said[1]
-    assert "Steps done: 300; the paper's runs have 50,000,000." in said[2]
+    assert said[1] == (
+        "Training runs in a cell: at most 1; the paper has 1. Brackets hold the 95% interval over "
+        "levels; from 5 runs on over training runs and levels. Fewer runs say nothing of another "
+        "training run."
+    )
+    assert said[2] == (
+        "Steps done: 300; the paper's runs have 50,000,000. Shorter runs can neither confirm nor "
+        "refute it."
+    )
     others = "PPO-D, PPO-D reg, PPO-IMP, PPO-IMP reg, PPO-l2, PPO-l2 reg"
     assert said[3] == f"Not all evaluated yet: {others}."
     assert len(said) == 5
     assert "Ours are the levels that follow the training set, with" in said[4]
+
+
+@pytest.mark.parametrize(("steps", "short"), [(47_499_999, True), (47_500_000, False)])
+def test_runs_below_95_percent_of_the_papers_length_are_short(results, cells, steps, short):
+    same = [dataclasses.replace(cell, steps=steps) for cell in cells.values()]
+    assert any("Steps done" in line for line in notes(results, same)) == short
+
+
+def test_a_cell_cannot_be_changed(cells):
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        cells["PPO", "seen", "sampled"].failed = 1
 
 
 def test_full_runs_that_are_all_there_are_not_called_short_or_missing(store):
