@@ -75,6 +75,11 @@ def test_every_pair_is_compared():
     assert set(EXCEPTIONS) == set(itertools.combinations(BASELINES, 2))
 
 
+@pytest.mark.parametrize("name", ["ACTIVATIONS", "MAY_CHANGE", "OBS_CLIP"])
+def test_the_control_baselines_share_their_constants(name):
+    assert getattr(ppo_reg, name) == getattr(trpo_reg, name)
+
+
 def test_what_the_baselines_should_share_is_shared():
     everywhere = {"RunError", "env_seeds", "gae", "load_checkpoint", "save_checkpoint", "step"}
     everywhere |= {"rollout", "train", "check_same", "check_finite", "Learner.state_dict"}
