@@ -173,6 +173,7 @@ def test_frames_and_infos_are_in_the_order_of_the_levels():
     frames, _ = env.reset(seed=0)
     assert env.num_envs == 6
     assert frames.shape == env.observation_space.shape
+    assert env.action_space.shape == (6,)
     assert frames[:, 0, 0, 0].tolist() == [4, 4, 2, 2, 3, 3]
     actions = np.arange(6)
     assert env.step(actions)[-1] == {}
