@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import sys
 import types
+from pathlib import Path
 
 import pytest
 
@@ -22,7 +24,8 @@ def toy(monkeypatch):
         module = types.ModuleType("baselines.toy")
         module.Args = dataclasses.make_dataclass("Args", fields, frozen=True)
         module.Args.__module__ = "baselines.toy"
-        module.MAY_CHANGE = set(may_change)
+        if may_change is not None:
+            module.MAY_CHANGE = set(may_change)
         if version is not None:
             module.VERSION = version
         monkeypatch.setitem(sys.modules, "baselines.toy", module)
@@ -50,6 +53,36 @@ def test_arguments_are_resolved_with_the_baselines_defaults():
     assert args["run_dir"] is None
     assert resolve("ppo_reg", {})["hidden_sizes"] == [64, 64]
     assert make_args("ppo_reg", {**args, "num_minibatches": 8}).hidden_sizes == (8,)
+
+
+def test_values_are_resolved_as_json_holds_them(toy):
+    toy(steps=4, scale=1.5, betas=(1, 2), layers=(1, 2), path=Path("a/b"), log=True, rate=None)
+    hints = sys.modules["baselines.toy"].Args.__annotations__
+    hints |= {"betas": tuple[float, ...], "layers": tuple[int, ...], "rate": float | None}
+    found = resolve("toy", {"scale": 2})
+    expected = {"steps": 4, "scale": 2.0, "betas": [1.0, 2.0], "layers": [1, 2], "path": "a/b"}
+    assert json.dumps(found) == json.dumps({**expected, "log": True, "rate": None})
+
+
+def test_defaults_may_be_made_and_an_argument_may_have_none(toy):
+    toy()
+
+    @dataclasses.dataclass
+    class Args:
+        env_id: str
+        layers: list = dataclasses.field(default_factory=lambda: [64])
+
+    Args.__module__ = "baselines.toy"
+    sys.modules["baselines.toy"].Args = Args
+    assert resolve("toy", {}) == {"layers": [64]}
+    assert resolve("toy", {"env_id": "x"}) == {"layers": [64], "env_id": "x"}
+
+
+def test_every_argument_decides_where_the_baseline_frees_none(toy):
+    toy(may_change=None, gamma=0.9, run_dir="a")
+    assert identify("toy", {}) == {
+        "baseline": "toy", "version": 1, "gamma": 0.9, "run_dir": "a",
+    }  # fmt: skip
 
 
 def test_a_changed_default_is_a_changed_run(toy):

@@ -9,7 +9,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from baselines import ppo_reg
 from harness.record import Record, block_of, thin
+from harness.suite import RunSpec
 
 NAN = math.nan
 
@@ -37,9 +39,26 @@ def test_a_block_is_one_row_by_hand():
     pd.testing.assert_frame_equal(thin(metrics, 1), metrics)
 
 
+@pytest.mark.parametrize(
+    "column", ["charts/episodic_return", "charts/episodic_length", "charts/success_rate"]
+)
+def test_means_over_episodes_are_weighted_by_their_number(column):
+    metrics = pd.DataFrame(
+        {
+            "global_step": [1, 2, 3, 4],
+            column: [1.0, 5.0, NAN, 7.0],
+            "charts/episodes": [3, 1, 0, 1],
+        }
+    )
+    rows = thin(metrics, 2)
+    assert rows[column].tolist() == [2.0, 7.0]  # (3 · 1 + 1 · 5) / 4, and one episode's own
+    assert rows["charts/episodes"].tolist() == [4, 1]
+
+
 def test_where_episodes_were_not_counted_each_update_with_any_counts_once():
     metrics = pd.DataFrame({"global_step": [1, 2, 3], "charts/episodic_return": [1.0, NAN, 5.0]})
     assert thin(metrics, 3)["charts/episodic_return"].tolist() == [3.0]
+    assert thin(metrics[1:], 2)["charts/episodic_return"].tolist() == [5.0]  # whatever the index
 
 
 def test_thinning_keeps_the_mean_over_all_episodes():
@@ -103,6 +122,22 @@ def test_the_same_files_or_the_same_outcome_at_another_speed_are_one_run(record)
 def test_another_outcome_is_told(record, changes):
     assert not record.same(changed(record, **changes))
     assert not changed(record, **changes).same(record)
+
+
+def test_a_record_cannot_be_changed_and_knows_its_length(record):
+    assert record.total_timesteps == 4000
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        record.updates = 2
+
+
+def test_a_record_is_compared_with_what_is_asked_for(record):
+    args = {"total_timesteps": 4000, "env_id": "x"}
+    record = dataclasses.replace(
+        record, spec={"baseline": "ppo_reg", "version": ppo_reg.VERSION, "args": args}
+    )
+    spec = RunSpec("suite", "PPO", "Hopper", "ppo_reg", args)
+    assert record.changes(spec) == {}
+    assert record.changes(spec.with_args(gamma=0.5)) == {"gamma": (0.99, 0.5)}
 
 
 def test_a_run_that_diverged_is_not_the_one_that_did_not(record):

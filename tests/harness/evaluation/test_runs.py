@@ -228,7 +228,8 @@ def test_flags_for_coinrun_are_refused_by_a_control_run(tmp_path, changed, flag)
 
 
 def test_flags_for_control_are_refused_by_a_run_of_coinrun(path):
-    with pytest.raises(EvaluationError, match=r"of ppo_reg_coinrun, .*leave out --episodes 3"):
+    flags = "--device and --levels and --repeats and --unseen: leave out --episodes 3"
+    with pytest.raises(EvaluationError, match=f"of ppo_reg_coinrun, .* by {flags}"):
         judge(path, episodes=3)
 
 
