@@ -99,6 +99,46 @@ def test_scores_and_evaluations_are_exact_and_curves_are_close(store, runs, root
     assert not record.changes(spec)
 
 
+def test_what_is_no_number_travels_as_it_is(store, runs, root):
+    inf = math.inf
+    write_run(store, runs[0], [1.0, inf, math.nan], [-inf, 2.0, 3.0])
+    own = dataclasses.replace(
+        store.record(runs[0]),
+        scores={"a": inf, "b": -inf, "c": math.nan, "d": 1 / 3},
+        evaluation=pd.DataFrame({"return": [inf, -inf, 0.5], "smoothness": [math.nan, inf, 1.0]}),
+    )
+    write_archive(root / "a.jsonl.xz", [own])
+    (record,) = read_archive(root / "a.jsonl.xz")
+    assert record.scores == pytest.approx(own.scores, rel=0, abs=0, nan_ok=True)
+    pd.testing.assert_frame_equal(record.evaluation, own.evaluation, check_exact=True)
+    for column in ("charts/episodic_return", "conditioning/psi"):
+        assert record.curves[column].tolist() == pytest.approx(
+            own.curves[column].tolist(), nan_ok=True
+        )
+
+    unknown = dataclasses.replace(own, done={"seconds": math.nan})
+    with pytest.raises(ValueError, match="JSON"):  # which another reader would not take
+        write_archive(root / "b.jsonl.xz", [unknown])
+
+
+def test_curves_have_five_digits_and_the_text_no_spaces(store, runs, root):
+    write_run(store, runs[0], [2 / 3, 123456.7, 2.0])
+    write_archive(root / "a.jsonl.xz", [store.record(runs[0])])
+    (record,) = read_archive(root / "a.jsonl.xz")
+    assert record.curves["charts/episodic_return"].tolist() == [0.66667, 123460.0, 2.0]
+    text = lzma.decompress((root / "a.jsonl.xz").read_bytes()).decode()
+    for line in text.splitlines():
+        assert line == json.dumps(json.loads(line), separators=(",", ":"))
+
+
+def test_an_archive_of_an_archive_is_the_same(store, runs, root, finish):
+    spec = runs[0].with_args(total_timesteps=25_000)  # three updates make a point
+    finish([spec])
+    write_archive(root / "a.jsonl.xz", [store.record(spec)])
+    write_archive(root / "b.jsonl.xz", read_archive(root / "a.jsonl.xz"))
+    assert (root / "a.jsonl.xz").read_bytes() == (root / "b.jsonl.xz").read_bytes()
+
+
 def test_an_archive_names_no_folder_of_this_machine_and_no_pickle(store, runs, root, finish):
     finish(runs[:1])
     path = root / "a.jsonl.xz"
@@ -165,6 +205,13 @@ def rewrite(path, change) -> None:
     """Change the lines of an archive and compress it again: xz's own checksum is right then."""
     lines = lzma.decompress(path.read_bytes()).decode().splitlines()
     path.write_bytes(lzma.compress("".join(f"{x}\n" for x in change(lines)).encode()))
+
+
+def test_only_the_format_xz_is_taken(archive):
+    older = lzma.compress(lzma.decompress(archive.read_bytes()), format=lzma.FORMAT_ALONE)
+    archive.write_bytes(older)  # it has no checksum of its own
+    with pytest.raises(ArchiveError, match="is damaged"):
+        read_archive(archive)
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 import threading
+import time
 
 import pytest
 
@@ -13,8 +14,28 @@ from baselines import ppo_reg
 from harness.archive import ArchiveError, archive_path, write_archive
 from harness.report.results import load_results
 from harness.scores import exact_scores
-from harness.store import DIVERGED, Store, StoreError, write_json
+from harness.store import DIVERGED, FINISHED, STATES, Store, StoreError, write_json
 from tests.harness.conftest import make_episodes, write_run
+
+
+def test_a_run_is_in_one_of_the_states(store, suite):
+    spec, crashed, diverged, *_ = suite.runs
+    seen = [store.state(spec)]
+    store.start(spec, [], [spec])
+    seen.append(store.state(spec))
+    with store.lock(spec):
+        seen.append(store.state(spec))
+    write_run(store, spec, [1.0])
+    seen += [store.state(spec), store.state(spec.with_args(gamma=0.9))]
+    store.start(crashed, [], [crashed])
+    store.finish(crashed, returncode=1, seconds=1.0)
+    write_run(store, diverged, [1.0], done=False, diverged=True)
+    store.finish(diverged, returncode=DIVERGED, seconds=1.0)
+    seen += [store.state(crashed), store.state(diverged)]
+    ends = ["done", "changed", "failed", "diverged"]
+    assert seen == ["pending", "interrupted", "running", *ends]
+    assert sorted(STATES) == sorted(seen)
+    assert FINISHED == ("done", "diverged")
 
 
 def test_a_run_goes_from_pending_to_done(store, suite):
@@ -44,6 +65,16 @@ def test_a_locked_run_is_running(store, suite):
         with store.lock(spec) as second:
             assert second is None
     assert store.state(spec) == "interrupted"
+
+
+def test_a_lock_that_another_holds_is_given_up_after_a_tenth_of_a_second(store, suite, monkeypatch):
+    waits = []
+    monkeypatch.setattr(time, "sleep", waits.append)
+    with store.lock(suite.runs[0]), store.lock(suite.runs[0]) as second:
+        assert second is None
+    assert sum(waits) == pytest.approx(0.1)
+    assert max(waits) <= 0.02
+    assert store.path(suite.runs[0], "lock").exists()
 
 
 def test_asking_for_the_state_does_not_make_another_give_a_run_up(store, suite):
@@ -127,12 +158,49 @@ def test_a_damaged_file_is_named_and_costs_one_run(store, suite):
     assert store.own_record(first) is not None
 
 
+def test_a_damaged_evaluation_is_named_also_of_a_run_that_was_extended(store, suite):
+    short = dataclasses.replace(suite.runs[0], evaluation={"levels": 1, "repeats": 1})
+    write_run(store, short, [1.0, 2.0], episodes=make_episodes(seen_sampled=[[1.0]]))
+    path = store.path(short, "evaluation.csv")
+    content = path.read_bytes()
+    path.write_bytes(content + b"x")
+    with pytest.raises(StoreError, match=r"evaluation\.csv is damaged"):
+        store.own_record(short)
+
+    path.write_bytes(content)
+    long = short.with_args(total_timesteps=400)
+    write_run(store, long, [1.0, 2.0, 3.0], episodes=make_episodes(seen_sampled=[[0.0]]))
+    assert store.own_record(short) is not None  # though metrics.csv has more rows than it had
+    store.path(short, "evaluation-200.csv").write_bytes(content + b"x")
+    with pytest.raises(StoreError, match=r"evaluation-200\.csv is damaged"):
+        store.verify(short, ("evaluation.csv",))
+    assert store.own_record(long) is not None
+
+
+def test_what_an_older_run_did_not_write_is_not_asked_for(store, suite):
+    """Neither the state nor checksums."""
+    spec = suite.runs[0]
+    write_run(store, spec, [1.0])
+    write_json(store.path(spec, "done.json"), {"rows": 1})
+    assert store.state(spec) == "done"
+    store.verify(spec, ("metrics.csv",))
+
+
+def test_an_unfinished_run_has_no_record(store, suite):
+    spec = suite.runs[0]
+    assert not store.was_extended(spec)
+    write_run(store, spec, [1.0], done=False)
+    assert store.own_record(spec) is None
+    assert store.record(spec) is None
+
+
 def test_advice_for_another_length_is_to_extend(store, suite):
     spec = suite.runs[0]
     write_run(store, spec, [1.0])
     with pytest.raises(StoreError, match=r"200 -> 400\): add --extend to continue it to 400 steps"):
         store.refuse_changed(spec.with_args(total_timesteps=400))
-    with pytest.raises(StoreError, match=r"200 -> 100\): name another --results-dir"):
+    elsewhere = r"200 -> 100\): name another --results-dir, or move it away$"
+    with pytest.raises(StoreError, match=elsewhere):
         store.refuse_changed(spec.with_args(total_timesteps=100))
     with pytest.raises(StoreError, match=r"gamma 0\.99 -> 0\.9\): name another --results-dir"):
         store.refuse_changed(spec.with_args(total_timesteps=400, gamma=0.9))
@@ -185,9 +253,10 @@ def test_a_run_without_rows_has_no_metrics(store, suite):
     assert store.metrics(spec) is None
     assert store.steps(spec) == 0
     store.start(spec, ["true"], [spec])
-    store.path(spec, "metrics.csv").write_text("global_step,charts/SPS\n")
-    assert store.metrics(spec) is None
-    assert store.steps(spec) == 0
+    for content in ("", "global_step,charts/SPS\n"):
+        store.path(spec, "metrics.csv").write_text(content)
+        assert store.metrics(spec) is None
+        assert store.steps(spec) == 0
 
 
 def test_a_torn_file_is_named(store, suite):
@@ -344,6 +413,7 @@ def test_steps_are_of_the_last_line_however_long_the_file(store, suite):
 def test_the_reports_folder_is_made(store):
     assert store.report_path("tiny") == store.report_path("tiny") == store.root / "tiny" / "report"
     assert (store.root / "tiny" / "report").is_dir()
+    assert store.report_path() == store.root / "report"
 
 
 # --- runs that are extended ----------------------------------------------------------------------
@@ -428,6 +498,10 @@ def test_an_archived_run_is_done_and_told(store, suite, tmp_path):
     assert [elsewhere.steps(spec), elsewhere.steps(other)] == [200, 0]
     assert elsewhere.record(spec).same(store.record(spec))
     assert elsewhere.own_record(spec) is None
+
+    record = dataclasses.replace(store.record(spec), scores={})  # of one without a row
+    write_archive(archive_path(tmp_path / "others", spec), [record])
+    assert Store(tmp_path / "elsewhere", tmp_path / "others").steps(spec) == 0
 
     write_run(elsewhere, spec, [1.0, 7.0])
     with pytest.raises(ArchiveError, match="has other results"):
