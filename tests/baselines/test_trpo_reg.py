@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 import math
+import runpy
 
 import numpy as np
 import pytest
@@ -24,7 +26,7 @@ from baselines.trpo_reg import (
 )
 from condwrap.settings import ConditioningArgs
 from tests.baselines.helpers import check_refusal, flat, pendulum, read_metrics
-from tests.baselines.test_ppo_reg import STANDARD, Fixed, normal_logprob
+from tests.baselines.test_ppo_reg import STANDARD, Fixed, normal_logprob, run_main
 
 # --- conjugate gradient --------------------------------------------------------------------------
 
@@ -854,6 +856,16 @@ def test_a_strong_penalty_brings_the_policy_into_range(tmp_path):
 )
 def test_bad_flags_of_trpo_are_refused_by_name(monkeypatch, capsys, tmp_path, flag, message):
     check_refusal(trpo_reg, [flag], message, monkeypatch, capsys, tmp_path)
+
+
+def test_the_file_is_a_program_whose_help_shows_every_flag(monkeypatch, capsys):
+    run_file = functools.partial(runpy.run_path, trpo_reg.__file__, run_name="__main__")
+    with pytest.raises(SystemExit) as stopped:
+        run_main(monkeypatch, "--help", main=run_file)
+    said = capsys.readouterr().out
+    assert stopped.value.code == 0
+    assert all(f"--{name.replace('_', '-')}" in said for name in vars(Args()))
+    assert "TRPO (Schulman et al., 2015" in said
 
 
 @pytest.mark.slow

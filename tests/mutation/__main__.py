@@ -40,7 +40,6 @@ ALSO = {  # tests of a module beside the file that mirrors it
     "baselines/trpo_reg.py": [
         "tests/baselines/test_shared.py",  # what is ppo_reg's is tested there
         "tests/baselines/test_pinned.py::test_numbers_change_only_with_the_version[trpo_reg]",
-        "tests/baselines/test_runs.py::test_it_runs_when_copied_alone_into_an_empty_folder[trpo_reg]",
     ],
     "condwrap/estimators.py": ["tests/condwrap/test_known_output.py"],
     "condwrap/policy.py": ["tests/condwrap/test_known_output.py"],

@@ -58,6 +58,7 @@ def deviation_of_both() -> float:
 def test_the_headline_is_the_mean_over_tasks(study, gains, word, words):
     claim = claim_of(study(shifted(dict(zip(TASKS, gains, strict=True))), tasks=TASKS))
     assert (claim.letter, claim.verdict, headline(claim).verdict) == ("b", word, word)
+    assert claim.statement == "The regularizer wins on most of the tasks."
     found_words = tuple(found(claim, "PPO reg - PPO: reward", task).verdict for task in TASKS)
     assert found_words == words
     for task, gain in zip(TASKS, gains, strict=True):
@@ -114,7 +115,7 @@ def test_both_contrasts_must_agree(study):
 def test_claim_c_is_trpo_against_ppo(study, gain, word):
     results = study(shifted({"Hopper": gain}, better="TRPO"), algorithms=("PPO", "TRPO"))
     claim = claim_of(results, "c")
-    assert claim.verdict == word
+    assert (claim.verdict, claim.statement) == (word, "TRPO beats PPO.")
     assert found(claim, "TRPO - PPO: reward", "Hopper").estimate.mean == pytest.approx(gain, abs=10)
     assert claim_of(results, "b") is None
 
@@ -154,7 +155,9 @@ def test_an_agent_without_a_score_has_no_pair(study):
     def reward(_task, algorithm, agent):
         return np.nan if (algorithm, agent) == ("PPO", 3) else 1.0 * agent
 
-    assert found(claim_of(study(reward)), "reward", "Hopper").estimate.n == 9
+    claim = claim_of(study(reward))
+    assert found(claim, "reward", "Hopper").estimate.n == 9
+    assert "Not yet run" not in claim.notes[0]  # the task has nine pairs
 
 
 def test_standard_differences_are_in_deviations_of_both_arms(study):
@@ -264,11 +267,21 @@ def test_final_policies_stand_beside_and_do_not_move_the_verdict(study):
     )
     claim = claim_of(results)
     assert claim.verdict == "supported"
-    assert "By the final policies: contradicted." in claim.notes
+    assert claim.notes == (
+        "PPO reg - PPO: 1 wins and 0 losses on 1 tasks, on most tasks.",
+        "final policies, PPO reg - PPO: 0 wins and 1 losses on 1 tasks.",
+        "By the final policies: contradicted.",
+    )
     assert headline(claim, "final policies, PPO reg - PPO").verdict == "contradicted"
     finding = found(claim, "final policies, PPO reg - PPO: reward", "Hopper")
     assert finding.estimate.mean == pytest.approx(-104.5)
     assert headline(claim).p_holm == headline(claim_of(study(shifted({"Hopper": UP})))).p_holm
+
+
+def test_final_policies_are_judged_where_some_were_evaluated(study):
+    final = {agent: 10.0 * agent for agent in range(6)}
+    claim = claim_of(study(shifted({"Hopper": UP}), final=lambda *key: final.get(key[2])))
+    assert found(claim, "final policies, PPO reg - PPO: reward", "Hopper").estimate.n == 6
 
 
 def test_final_policies_are_also_judged_without_the_failed_runs(study):
@@ -315,6 +328,8 @@ def test_one_pair_is_undecided_and_says_what_it_takes(study):
     # a task of three has 5% / 5 / 3, which 2 / 2^10 is below
     assert found(claim, "reward", "Ant").note == "10 pairs could decide"
     assert np.isnan(found(claim, "reward", "Ant").detectable)
+    standard = found(claim, "PPO reg - PPO: in standard deviations", "Ant")
+    assert standard.note == "10 pairs could decide"
 
 
 def test_runs_that_still_learn_are_not_matched_with_finished_ones(study):
@@ -330,7 +345,11 @@ def test_most_of_the_tasks_are_not_the_tasks_that_have_been_run(study, missing):
     win = shifted(dict.fromkeys(TASKS, UP))
     claim = claim_of(study(lambda *key: None if key[0] == missing else win(*key), tasks=TASKS))
     assert claim.verdict == "undecided"
-    assert claim.notes[0].endswith(f"Not yet run: {missing}.")
+    assert claim.notes[0] == (
+        f"PPO reg - PPO: 2 wins and 0 losses on 2 tasks, on most tasks. Not yet run: {missing}."
+    )
+    reached = {f.task for f in claim.findings}
+    assert reached == {"all", *TASKS} - {missing}
 
 
 def test_a_contrast_that_has_not_run_leaves_the_claim_open(study):
@@ -365,6 +384,22 @@ def test_twelve_pairs_could_decide_one_of_sixteen_tasks(study):
         assert np.isnan(finding.detectable)
 
 
+def test_a_contrast_of_which_one_arm_has_run_has_no_pair(study):
+    win = shifted({"Hopper": UP})
+    results = study(lambda *key: None if key[1] == "TRPO" else win(*key), algorithms=FOUR)
+    claim = claim_of(results)
+    assert claim.notes[-1] == "No pairs yet: TRPO reg - TRPO."
+    assert {f.about.partition(":")[0] for f in claim.findings} == {"PPO reg - PPO"}
+
+
+def test_without_any_pair_a_claim_is_undecided(study):
+    win = shifted({"Hopper": UP})
+    agents = agent_table(study(lambda *key: None if "reg" in key[1] else win(*key)))
+    claim = comparison_claim(agents, "b", set())
+    assert (claim.verdict, claim.findings, claim.notes) == ("undecided", [], ())
+    assert (claim.failed, claim.without_failed) == (0, "")
+
+
 PLANNED = {(task, name) for task in TASKS for name in ("PPO", "PPO reg")}
 
 
@@ -393,6 +428,13 @@ def test_only_contrasts_that_both_arms_plan_are_open(study, planned, open_):
     claim = comparison_claim(agents, "b", {("Hopper", "PPO"), ("Hopper", "PPO reg")} | more)
     assert ("No pairs yet: TRPO reg - TRPO." in claim.notes) == open_
     assert claim.verdict == ("undecided" if open_ else "supported")
+
+
+def test_a_contrast_is_open_if_it_is_planned_on_any_task(study):
+    agents = agent_table(study(shifted({"Hopper": UP})))
+    planned = {("Hopper", name) for name in FOUR} | {("Ant", "TRPO")}
+    claim = comparison_claim(agents, "b", planned)
+    assert claim.notes[-1] == "No pairs yet: TRPO reg - TRPO."
 
 
 def test_failures_are_counted_where_they_happened(study):

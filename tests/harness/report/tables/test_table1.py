@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from rich.console import Console
@@ -44,6 +46,40 @@ def test_a_cell_is_the_mean_over_agents_of_their_training_score(cells):
     assert (cell.seeds, cell.agents, cell.planned, cell.failed) == (2, 4, 4, 0)
     assert (cell.steps, cell.window) == (200, 20)
     assert cell.paper == 106.8
+
+
+def test_a_cell_cannot_be_changed(cells):
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        cells[0].failed = 1
+
+
+def test_two_agents_have_a_range_too(study):
+    cell = make_cells(study(lambda _, __, agent: 1.0 * agent, agents=2))[0]
+    assert cell.text == "0.5 {0.0 to 1.0} (n 2, 0 failed, finds –)"
+
+
+def test_steps_are_of_the_agent_that_has_done_the_fewest(store, suite):
+    updates = {("PPO", 1, 0): 3, ("PPO", 1, 1): 2, ("PPO", 2, 0): 4}
+    for spec in suite.runs:
+        key = (spec.algorithm, spec.args["seed"], spec.args["agent"])
+        if spec.environment == "Hopper" and key in updates:
+            write_run(store, spec, [1.0] * updates[key])
+    assert make_cells(load_results(suite, store))[0].steps == 200
+
+
+def test_the_window_is_a_tenth_of_the_longest_run_of_the_cell(results):
+    lengths = {"ppo__Hopper__s1__a0": 400, "ppo-reg__Hopper__s1__a0": 1000}
+    runs = [
+        run.with_args(total_timesteps=lengths.get(run.run_id, 200)) for run in results.suite.runs
+    ]
+    assert [run.run_id for run in runs] == [run.run_id for run in results.suite.runs]
+    suite = dataclasses.replace(results.suite, runs=runs)
+    cells = make_cells(dataclasses.replace(results, suite=suite))
+    found = {(c.environment, c.algorithm): c.window for c in cells}
+    assert found == {
+        ("Hopper", "PPO"): 40, ("Hopper", "PPO reg"): 100,
+        ("Reacher", "PPO"): 20, ("Reacher", "PPO reg"): 20,
+    }  # fmt: skip
 
 
 def test_few_agents_have_a_range_and_no_interval(cells):
@@ -105,21 +141,62 @@ def test_failed_agents_count_with_the_worst_of_their_task(study):
     assert (plain.agents, plain.failed) == (10, 1)
     assert plain.estimate.mean == pytest.approx((sum(range(9)) - 20) / 10)
     assert "1 failed" in plain.text
-    assert "A failed run's numbers became non-finite" in " ".join(notes(results, [plain]))
+    failure = (
+        "A failed run's numbers became non-finite. It counts with the worst score of its task."
+    )
+    assert failure in notes(results, make_cells(results))
 
 
 def test_missing_cells_are_missing(cells, results):
     assert [c.text for c in cells[2:]] == ["–", "–"]
-    said = "\n".join(notes(results, cells))
-    assert "Missing (–): PPO on Reacher, PPO reg on Reacher." in said
-    assert "Incomplete: PPO reg on Hopper (1 of 4)." in said
+    assert notes(results, cells)[-2:] == [
+        "Missing (–): PPO on Reacher, PPO reg on Reacher.",
+        "Incomplete: PPO reg on Hopper (1 of 4).",
+    ]
+    half = [dataclasses.replace(cell, agents=2) for cell in cells]
+    assert notes(results, half)[-1] == (
+        "Incomplete: PPO on Hopper (2 of 4), PPO reg on Hopper (2 of 4), PPO on Reacher (2 of 4), "
+        "PPO reg on Reacher (2 of 4)."
+    )
 
 
 def test_the_notes_say_how_much_shorter_the_runs_are(cells, results):
-    said = "\n".join(notes(results, cells))
-    assert "Steps done: 200 to 300; the paper's runs have 5,000,000." in said
-    assert "Training scores are over the last 20 steps" in said
-    assert "Agents in a cell: 1 to 4; seeds: 1 to 2." in said
+    assert notes(results, cells)[:3] == [
+        "Steps done: 200 to 300; the paper's runs have 5,000,000. Shorter runs can neither confirm "
+        "nor refute it.",
+        "Training scores are over the last 20 steps; the paper's are over its last 100 updates, "
+        "200,000 steps.",
+        "Agents in a cell: 1 to 4; seeds: 1 to 2. The paper has 10 agents for each of 3 seeds.",
+    ]
+
+
+def test_one_short_cell_among_full_ones_is_told(cells, results):
+    full = [dataclasses.replace(cell, agents=4, steps=5_000_000) for cell in cells]
+    assert not any("Steps done" in line for line in notes(results, full))
+    short = [dataclasses.replace(full[0], steps=4_999_999), *full[1:]]
+    assert notes(results, short)[0].startswith("Steps done: 4,999,999 to 5,000,000; ")
+
+
+def test_the_notes_begin_with_the_suites_own(cells, results):
+    suite = dataclasses.replace(results.suite, note="Mind this.")
+    assert notes(dataclasses.replace(results, suite=suite), cells)[0] == "Mind this."
+
+
+EXPLAINED = [
+    "[Brackets] hold the 95% interval of the mean over agents, Student's with a correction for "
+    "skewness. {Braces} hold the smallest and the largest score, where there are fewer than 5 "
+    "agents, or fewer than 30 with skewed scores, or where all scores are equal: no interval can "
+    "be trusted there.",
+    "In parentheses: agents, failed ones among them, and the difference to an arm of the same "
+    "spread that would have been found with 80% power at 5%.",
+]
+
+
+@pytest.mark.parametrize(("agents", "explained"), [((1, 1), []), ((1, 2), EXPLAINED)])
+def test_what_a_cell_holds_is_explained_if_any_has_two_agents(cells, results, agents, explained):
+    some = [dataclasses.replace(c, agents=n) for c, n in zip(cells[:2], agents, strict=True)]
+    said = notes(results, some)
+    assert [line for line in said if line.startswith(("[Brackets]", "In parentheses"))] == explained
 
 
 def test_full_runs_are_not_called_short(store, suite_file):
@@ -140,9 +217,8 @@ def test_runs_of_another_configuration_are_left_out_and_named(store, suite, suit
     results = load_results(load_suite(str(suite_file), total_timesteps=300), store)
     cells = make_cells(results)
     assert all(c.agents == 0 for c in cells)
-    assert (
-        "Left out, since run with other settings: ppo__Hopper__s1__a0" in notes(results, cells)[-1]
-    )
+    left_out = ", ".join(spec.run_id for spec in suite.runs)
+    assert notes(results, cells)[-1] == f"Left out, since run with other settings: {left_out}."
 
 
 def test_smoke_says_what_it_is_not():
@@ -153,13 +229,46 @@ def test_smoke_says_what_it_is_not():
 def test_markdown_is_a_table_beside_the_papers_numbers(cells, results):
     lines = to_markdown(results, cells).splitlines()
     assert "| task | PPO | PPO, paper | PPO reg | PPO reg, paper |" in lines
+    assert "What each cell rests on:" in lines
+    assert "| task | algorithm | agents | failed | seeds | steps | window |" in lines
     hopper = next(line for line in lines if line.startswith("| Hopper"))
     assert hopper.startswith("| Hopper | 15.5 {")
     assert hopper.endswith(") | 106.8 | 8.0 (n 1, 0 failed, finds –) | 18.6 |")
     assert "| Reacher | – | -13.5 | – | -7.4 |" in lines
     assert "| Hopper | PPO | 4 of 4 | 0 | 2 | 200 | 20 |" in lines
     assert "| Reacher | PPO | 0 of 4 | 0 | 0 | 0 | 20 |" in lines
-    assert lines[2].startswith("Training score: mean return of the episodes that ended in")
+    assert lines[2] == (
+        "Training score: mean return of the episodes that ended in the last tenth of the run, at "
+        "most 200,000 steps."
+    )
+    assert lines[1] == ""
+    assert to_markdown(results, cells).endswith("| 20 |\n")
+
+
+def test_a_column_is_there_if_any_cell_is_and_a_cell_if_it_is_planned(cells, results):
+    header, _ = to_rows(results.suite, [c for c in cells if c.algorithm == "PPO"])
+    assert header == ["task", "PPO", "PPO, paper"]
+
+    runs = [
+        run for run in results.suite.runs if (run.environment, run.algorithm) != ("Hopper", "PPO")
+    ]
+    suite = dataclasses.replace(results.suite, runs=runs)
+    planned = make_cells(dataclasses.replace(results, suite=suite))
+    assert [(c.environment, c.algorithm) for c in planned] == [
+        ("Hopper", "PPO reg"), ("Reacher", "PPO"), ("Reacher", "PPO reg"),
+    ]  # fmt: skip
+    assert to_rows(suite, planned)[1] == [
+        ["Hopper", "", "", "8.0 (n 1, 0 failed, finds –)", "18.6"],
+        ["Reacher", "–", "-13.5", "–", "-7.4"],
+    ]
+
+
+def test_a_task_that_the_paper_has_not_has_no_number_of_its(study):
+    results = study(lambda *_: None, tasks=("Hopper", "Pendulum"))
+    cells = make_cells(results)
+    assert to_rows(results.suite, cells)[1][1] == ["Pendulum", "–", "", "–", ""]
+    table = to_rich(results, cells)
+    assert list(table.columns[1].cells)[1] == "–\n[dim]paper –[/]"
 
 
 def test_the_frame_has_a_row_for_each_cell(cells):
@@ -182,6 +291,20 @@ def test_the_terminal_shows_every_task_with_the_papers_number_below(cells, resul
     assert "paper -13.5" in lines[reacher + 1]
 
 
+def test_the_terminal_sets_numbers_to_the_right_and_what_was_published_below(cells, results):
+    table = to_rich(results, cells)
+    assert table.title == "tiny: training score"
+    assert table.show_lines
+    assert [column.header for column in table.columns] == ["task", "PPO", "PPO reg"]
+    assert [column.justify for column in table.columns] == ["left", "right", "right"]
+    assert [list(column.cells) for column in table.columns] == [
+        ["Hopper", "Reacher"],
+        ["15.5 {10.0 to 21.0}\n(n 4, 0 failed, finds –)\n[dim]paper 106.8[/]",
+         "–\n[dim]paper -13.5[/]"],
+        ["8.0\n(n 1, 0 failed, finds –)\n[dim]paper 18.6[/]", "–\n[dim]paper -7.4[/]"],
+    ]  # fmt: skip
+
+
 def test_the_terminal_shows_intervals_in_their_brackets(study):
     results = study(lambda _, __, agent: 1.0 * agent)
     console = Console(record=True, width=160)
@@ -202,7 +325,9 @@ def test_the_final_table_is_of_deterministic_episodes_alone(study):
     header, rows = to_rows(results.suite, cells)
     assert header == ["task", "PPO", "PPO reg"]
     assert len(rows[0]) == 3
-    assert "Final policy" in to_markdown(results, cells, "final")
+    about = "Final policy: mean return of its deterministic actions over the evaluation."
+    assert to_markdown(results, cells, "final").splitlines()[2] == about
+    assert to_rich(results, cells, "final").title == "synthetic: final policy"
 
 
 def test_without_evaluations_the_final_table_is_empty(study):
@@ -220,3 +345,9 @@ def test_the_zoos_agents_stand_beside_strongs_final_policies(store):
     assert found["Reacher"] == ("17.1 ± 11", "14.7 ± 11.6")
     assert found["Humanoid"] == ("", "")
     assert not any(c.zoo for c in make_cells(results))
+    table = to_rich(results, cells)
+    assert [column.header for column in table.columns] == ["task", "PPO", "PPO reg", "TRPO",
+                                                           "TRPO reg"]  # fmt: skip
+    ppo = dict(zip(table.columns[0].cells, table.columns[1].cells, strict=True))
+    assert ppo["Hopper"] == "–\n[dim]zoo 2575 ± 223[/]"
+    assert ppo["Humanoid"] == "–\n[dim]zoo –[/]"
