@@ -115,6 +115,8 @@ def test_a_raised_version_is_a_changed_run(toy):
     before = saved()
     toy(version=2, gamma=0.9)
     assert changes(before) == {"version": (1, 2)}
+    assert changes(saved(version=2)) == {}
+    assert changes(saved(version=3)) == {"version": (3, 2)}
     del before["version"]  # as in a file from before there were versions
     assert changes(before) == {"version": (1, 2)}
 
