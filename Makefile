@@ -7,7 +7,8 @@ INSTALLED := .venv/installed
 # What `make mutate` changes, and how many changes to a module it draws; 0: all, which takes hours.
 MODULES ?= $(wildcard condwrap/[a-z]*.py) condwrap/attacks condwrap/penalties \
 	baselines/ppo_reg.py baselines/trpo_reg.py \
-	harness/suite.py harness/store.py harness/report/tables/table1.py harness/report/tables/table2.py \
+	harness/suite.py harness/store.py harness/archive.py harness/record.py harness/identity.py \
+	harness/report/tables/table1.py harness/report/tables/table2.py \
 	harness/statistics harness/report/claims harness/evaluation
 SAMPLE ?= 60
 
