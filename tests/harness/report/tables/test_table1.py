@@ -305,6 +305,19 @@ def test_the_terminal_sets_numbers_to_the_right_and_what_was_published_below(cel
     ]  # fmt: skip
 
 
+def test_names_with_brackets_and_commas_are_shown_as_they_are(cells, results):
+    names = {"environments": ["Hopper [bold]"], "algorithms": ["PPO, big"]}
+    suite = dataclasses.replace(results.suite, **names)
+    cell = dataclasses.replace(cells[0], environment="Hopper [bold]", algorithm="PPO, big")
+    table = to_rich(dataclasses.replace(results, suite=suite), [cell])
+    assert [column.header for column in table.columns] == ["task", "PPO, big"]
+    console = Console(record=True, width=160)
+    console.print(table)
+    assert "Hopper [bold]" in console.export_text()
+    (shown,) = table.columns[1].cells
+    assert shown.startswith("15.5 {10.0 to 21.0}")
+
+
 def test_the_terminal_shows_intervals_in_their_brackets(study):
     results = study(lambda _, __, agent: 1.0 * agent)
     console = Console(record=True, width=160)
