@@ -68,6 +68,11 @@ def attach(module: nn.Module, penalty: Attachable, *, obs: int | str = 0) -> Att
         >>> handle.metrics()["attach/backwards"]
         1.0
     """
+    return Attached(module, penalty, obs)
+
+
+def _check(module: nn.Module, penalty: Attachable) -> None:
+    """Raise unless the penalty can be computed from a call of the module."""
     if not isinstance(module, nn.Module):
         raise TypeError(
             f"module must be a torch.nn.Module, got {type(module).__name__}: pass the policy's "
@@ -80,7 +85,6 @@ def attach(module: nn.Module, penalty: Attachable, *, obs: int | str = 0) -> Att
             f"tell: add {type(penalty).__name__}(...)(policy, obs, "
             f"{', '.join(f'{name}=...' for name in needs)}).penalty to the loss instead"
         )
-    return Attached(module, penalty, obs)
 
 
 class Attached:
@@ -89,7 +93,8 @@ class Attached:
     scale: Scale
     """factor of the penalty's gradient, or a callable that gives it at each backward pass"""
 
-    def __init__(self, module: nn.Module, penalty: Attachable, obs: int | str) -> None:
+    def __init__(self, module: nn.Module, penalty: Attachable, obs: int | str = 0) -> None:
+        _check(module, penalty)
         self.module = module
         self.penalty = penalty
         self.obs = obs
@@ -98,7 +103,7 @@ class Attached:
         self._forwards = 0
         self._sums: dict[str, float] = {}
         self._backwards = 0
-        self._hook = module.register_forward_hook(_Hook(self), with_kwargs=True)
+        self._hook = module.register_forward_hook(Hook(self._on_call), with_kwargs=True)
 
     def metrics(self) -> dict[str, float]:
         """Means of the penalty's metrics over the backward passes since the last call.
@@ -129,6 +134,11 @@ class Attached:
         traceback: TracebackType | None,
     ) -> None:
         self.remove()
+
+    def _on_call(
+        self, module: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any], output: Any
+    ) -> Any:
+        return self._carry(args, kwargs, output)
 
     @torch.compiler.disable  # type: ignore[untyped-decorator]
     def _carry(self, args: tuple[Any, ...], kwargs: dict[str, Any], output: Any) -> Any:
@@ -163,23 +173,25 @@ class Attached:
         finally:
             self._measuring = False
 
-        for name, value in result.metrics().items():
-            self._sums[name] = self._sums.get(name, 0.0) + value
-        self._backwards += 1
+        self._record(result.metrics())
         scale = self.scale() if callable(self.scale) else self.scale
         return result.penalty * scale
 
+    def _record(self, metrics: dict[str, float]) -> None:
+        """Keep what one backward pass measured."""
+        for name, value in metrics.items():
+            self._sums[name] = self._sums.get(name, 0.0) + value
+        self._backwards += 1
 
-class _Hook:
-    """The forward hook. A copy and a pickle of it do nothing."""
 
-    def __init__(self, handle: Attached) -> None:
-        self.handle = handle
+class Hook:
+    """A hook of a module. A copy and a pickle of it do nothing."""
 
-    def __call__(
-        self, module: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any], output: Any
-    ) -> Any:
-        return self.handle._carry(args, kwargs, output)
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function = function
+
+    def __call__(self, *args: Any) -> Any:
+        return self.function(*args)
 
     def __reduce__(self) -> tuple[Callable[[], Any], tuple[()]]:
         return _make_inert, ()
