@@ -81,6 +81,7 @@ class AttachedModel(Attached):
         super().__init__(actor, penalty)
         self.model = model
         self.actor = actor
+        actor.hold()
         self._stage_hooks = [
             actor.first.register_forward_pre_hook(Hook(self._enter)),
             actor.last.register_forward_hook(Hook(self._leave)),

@@ -81,8 +81,11 @@ class Actor(nn.Module):
         self._obs = None
         return None if obs is None else (obs,)
 
+    def hold(self) -> None:
+        """Change what is needed beside the hooks."""
+
     def release(self) -> None:
-        """Undo what was changed beside the hooks."""
+        """Undo what `hold` did."""
 
 
 class Masked(NamedTuple):
@@ -112,6 +115,9 @@ class MaskedActor(Actor):
             return args
         rows = len(pytree.tree_leaves(args)[0])
         return (Masked(args[0], torch.as_tensor(masks, dtype=torch.bool).reshape(rows, -1)),)
+
+    def hold(self) -> None:
+        self.arguments.install()
 
     def release(self) -> None:
         self.arguments.remove()
@@ -149,6 +155,10 @@ class RecurrentActor(Actor):
         obs = pytree.tree_map(lambda x: x[real], args[0])
         return obs, given["lstm_states"].pi, starts, real
 
+    def hold(self) -> None:
+        self.arguments.install()
+        self.batches.install()
+
     def release(self) -> None:
         self.arguments.remove()
         self.batches.remove()
@@ -162,7 +172,9 @@ class Recorded:
         self.name = name
         self.method = getattr(owner, name)
         self.given: dict[str, Any] | None = None
-        setattr(owner, name, self)
+
+    def install(self) -> None:
+        setattr(self.owner, self.name, self)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         self.given = inspect.signature(self.method).bind(*args, **kwargs).arguments
@@ -182,7 +194,9 @@ class RecordedBatches:
         self.buffer = buffer
         self.method = buffer.get
         self.real: Tensor | None = None
-        buffer.get = self
+
+    def install(self) -> None:
+        self.buffer.get = self
 
     def __call__(self, batch_size: int | None = None) -> Iterator[Any]:
         for samples in self.method(batch_size):

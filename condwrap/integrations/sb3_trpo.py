@@ -80,8 +80,8 @@ class AttachedTRPO(AttachedModel):
 
         self._forwards += 1
         self._old = objective
-        self._surrogate = float(objective)
-        self._penalty = float(penalty)
+        self._surrogate = objective.item()
+        self._penalty = penalty.item()
         # a constant with coefficient 0, which must not touch a bit
         return objective - penalty if penalty.requires_grad else objective
 
@@ -108,7 +108,7 @@ class AttachedTRPO(AttachedModel):
         """Let the comparison that comes next see the penalty of the parameters that it tries."""
         if self._noise is not None:
             self.penalty.generator.set_state(self._noise)  # type: ignore[attr-defined]
-        penalty = float(self._measure(self.actor, obs, output))
+        penalty = self._measure(self.actor, obs, output).item()
         self._old.data.fill_(self._surrogate - self._penalty + penalty)  # type: ignore[union-attr]
 
     def _record(self, metrics: dict[str, float]) -> None:

@@ -209,7 +209,9 @@ def test_psi_is_in_the_models_logger(case):
     model.set_logger(Logger(None, [memory]))
     handle = attach(model, ConditioningRegularizer(0.0))
     model.learn(case.steps, log_interval=1)
-    logged = [values["conditioning/psi"] for values in memory.dumped if "conditioning/psi" in values]
+    logged = [
+        values["conditioning/psi"] for values in memory.dumped if "conditioning/psi" in values
+    ]
     assert logged
     assert all(0 < psi <= 1 for psi in logged)
     assert "conditioning/quotient_q50" in memory.dumped[-1] | dict(model.logger.name_to_value)
@@ -295,7 +297,16 @@ def loss_of(model, obs):
 def gradients_of(model, loss):
     model.policy.zero_grad()
     loss.backward()
-    return {name: p.grad.clone() for name, p in model.policy.named_parameters() if p.grad is not None}
+    return {
+        name: p.grad.clone() for name, p in model.policy.named_parameters() if p.grad is not None
+    }
+
+
+def assert_close(found, expected):
+    """Within 0.1% of a parameter's largest gradient: SB3 computes in float32."""
+    for name, value in expected.items():
+        error = (found[name] - value).abs().max()
+        assert error <= 1e-3 * max(float(value.abs().max()), 1e-3), name
 
 
 def assert_gradient_is_explicit(model, **arguments):
@@ -316,9 +327,8 @@ def assert_gradient_is_explicit(model, **arguments):
         torch.manual_seed(1)
         found = gradients_of(model, loss_of(model, obs))
     assert found.keys() == expected.keys()
-    assert any((expected[name] - plain[name]).abs().max() > 1e-3 for name in plain)
-    for name, value in expected.items():
-        torch.testing.assert_close(found[name], value, rtol=1e-4, atol=1e-5)
+    assert any((expected[name] - plain[name]).abs().max() > 1e-2 for name in plain)
+    assert_close(found, expected)
 
 
 @pytest.mark.parametrize(
@@ -353,8 +363,7 @@ def test_dicts_of_observations():
     expected = gradients_of(model, loss_of(model, parts) + explicit)
     with attach(model, ConditioningRegularizer(LARGE)):
         found = gradients_of(model, loss_of(model, parts))
-    for name, value in expected.items():
-        torch.testing.assert_close(found[name], value, rtol=1e-4, atol=1e-5)
+    assert_close(found, expected)
 
 
 def test_one_hot_observations_are_perturbed_after_preprocessing():
@@ -470,15 +479,16 @@ def test_masked_logits_do_not_count(space, fraction):
         actions = torch.zeros(8, len(sizes)).squeeze(-1)
         _, logprob, _ = policy.evaluate_actions(obs, actions, action_masks=allowed.float())
         found = gradients_of(model, 0.0 * logprob.mean())
-    for name in expected:
-        torch.testing.assert_close(found[name], expected[name], rtol=1e-4, atol=1e-6)
+    assert_close(found, expected)
     assert torch.equal(seen.known[0] == 0, ~allowed)
 
 
 @pytest.mark.parametrize("algorithm", [sb3.PPO, sb3_contrib.MaskablePPO])
 @pytest.mark.parametrize("space", [spaces.MultiDiscrete([3, 2]), spaces.MultiBinary(2)])
 def test_several_actions_at_once(algorithm, space):
-    model = algorithm("MlpPolicy", Walk(action_space=space), n_steps=32, batch_size=32, device="cpu")
+    model = algorithm(
+        "MlpPolicy", Walk(action_space=space), n_steps=32, batch_size=32, device="cpu"
+    )
     seen = Seen(LARGE)
     attach(model, seen)
     model.learn(32, **({"use_masking": False} if algorithm is not sb3.PPO else {}))
@@ -520,8 +530,7 @@ def test_padded_steps_do_not_count():
         both = RNNStates(states, states)
         _, logprob, _ = policy.evaluate_actions(obs, torch.zeros(6), both, starts)
         found = gradients_of(model, 0.0 * logprob.mean())
-    for name in expected:
-        torch.testing.assert_close(found[name], expected[name], rtol=1e-4, atol=1e-6)
+    assert_close(found, expected)
 
 
 def test_the_models_own_update_counts_each_step_once():
@@ -542,13 +551,16 @@ class Spy(TRPO):
 
     def train(self):
         self.kept = {}
-        self.before = self.objectives()
+        order = np.random.get_state()
+        self.before = self.objectives(order)
         super().train()
-        self.after = self.objectives()
+        self.after = self.objectives(order)
 
-    def objectives(self):
-        """The surrogate and psi on the same noise, by SB3's own methods."""
+    def objectives(self, order):
+        """The surrogate and the penalty on the same noise, by SB3's own methods."""
+        np.random.set_state(order)  # the buffer's next permutation is that of the update
         (batch,) = self.rollout_buffer.get(batch_size=None)
+        np.random.set_state(order)
         distribution = self.policy.get_distribution(batch.observations)
         advantages = (batch.advantages - batch.advantages.mean()) / (batch.advantages.std() + 1e-8)
         ratio = (distribution.log_prob(batch.actions) - batch.old_log_prob).exp()
@@ -590,9 +602,8 @@ def test_trpo_climbs_surrogate_minus_penalty():
     plain = spied(None)
     model = spied(LARGE)
     kept = model.kept
-    torch.testing.assert_close(
-        kept["objective"], kept["surrogate"] - kept["penalty"], rtol=1e-4, atol=1e-6
-    )
+    error = kept["objective"] - (kept["surrogate"] - kept["penalty"])
+    assert error.abs().max() < 1e-3 * kept["penalty"].abs().max()
     assert kept["penalty"].abs().max() > 1e-2
     assert torch.equal(kept["kl"], plain.kept["kl"])  # what Fisher products are made of
 
@@ -608,12 +619,36 @@ def test_trpos_line_search_accepts_what_improves_the_difference():
     assert logged == pytest.approx(new_surrogate.item(), abs=1e-5)
 
 
+@dataclasses.dataclass(frozen=True)
+class Growing:
+    """A penalty that is larger at each call, so that no step improves the difference."""
+
+    values: list = dataclasses.field(default_factory=list)
+
+    def __call__(self, policy, obs, *, output=None):
+        self.values.append(1e3 * len(self.values))
+        return Grown(output.sum() * 0.0 + self.values[-1])
+
+
+@dataclasses.dataclass(frozen=True)
+class Grown:
+    penalty: torch.Tensor
+
+    def metrics(self):
+        return {"grown": self.penalty.item()}
+
+
 def test_trpo_reports_the_surrogate_where_no_step_is_accepted():
-    model = spied(LARGE, line_search_max_iter=1, target_kl=1e-12)
+    model = Spy("MlpPolicy", "Pendulum-v1", n_steps=128, batch_size=64, seed=0, device="cpu")
+    penalty = Growing()
+    handle = attach(model, penalty)
+    model.learn(128)
+    assert len(penalty.values) == 1 + model.line_search_max_iter
+    assert handle.metrics()["grown"] == 0  # before the step, and only that
     assert model.logger.name_to_value["train/is_line_search_success"] == 0
     logged = model.logger.name_to_value["train/policy_objective"]
     assert logged == pytest.approx(model.before[0].item(), abs=1e-6)
-    assert torch.equal(model.before[1], model.after[1])  # psi is as it was
+    assert torch.equal(model.before[1], model.after[1])  # the actor is as it was
 
 
 def test_trpos_compared_steps_see_the_same_noise():
@@ -672,5 +707,7 @@ def test_a_penalty_that_needs_successors_is_refused():
 def test_the_examples_lower_psi(path, capsys):
     assert len(path.read_text().splitlines()) <= 40
     runpy.run_path(str(path), run_name="__main__")
-    numbers = [float(line.split()[-1]) for line in capsys.readouterr().out.splitlines() if "psi" in line]
+    numbers = [
+        float(line.split()[-1]) for line in capsys.readouterr().out.splitlines() if "psi" in line
+    ]
     assert numbers[-1] < numbers[0]
