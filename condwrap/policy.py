@@ -7,6 +7,7 @@ that training depends on, nor must its own randomness or its batch statistics co
 from __future__ import annotations
 
 import contextlib
+import contextvars
 import functools
 import inspect
 from collections.abc import Callable, Iterator, Mapping
@@ -19,6 +20,8 @@ from torch.nn.modules.batchnorm import _NormBase
 
 Policy = Callable[[Any], Any]  # obs -> Tensor | Distribution | tuple, list or dict of them
 Select = str | Callable[[Any], Any]
+
+_measuring = contextvars.ContextVar("measuring", default=False)
 
 SELECTIONS = ("default", "mean", "logits", "probs")
 _MEAN = (td.Normal, td.MultivariateNormal, td.LowRankMultivariateNormal)
@@ -165,11 +168,25 @@ def untouched(policy: Policy, device: torch.device) -> Iterator[None]:
             yield
         else:
             devices = [device] if device.type == "cuda" else []
-            with _copied_buffers(found), torch.random.fork_rng(devices):
+            with _copied_buffers(found), torch.random.fork_rng(devices), _marked():
                 yield
     finally:
         for norm in norms:
             norm.training = True
+
+
+def is_measuring() -> bool:
+    """Whether this is an evaluation inside `untouched`, which an attached penalty leaves alone."""
+    return _measuring.get()
+
+
+@contextlib.contextmanager
+def _marked() -> Iterator[None]:
+    token = _measuring.set(True)
+    try:
+        yield
+    finally:
+        _measuring.reset(token)
 
 
 @contextlib.contextmanager

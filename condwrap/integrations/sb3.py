@@ -16,11 +16,11 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import Tensor, nn
 
-from condwrap.attach import Attached, Hook, Penalty
+from condwrap.attach import Attachable, Attached, Hook
 from condwrap.integrations.sb3_actors import Actor, find_actor, names_of
 
 
-def attach(model: BaseAlgorithm, penalty: Penalty) -> AttachedModel:
+def attach(model: BaseAlgorithm, penalty: Attachable) -> AttachedModel:
     """Add a penalty's gradient to every update of a model's actor, and log its metrics.
 
     `model.learn`, `save` and `load` are used as before. Whatever `condwrap.attach` says of the
@@ -77,7 +77,7 @@ def attach(model: BaseAlgorithm, penalty: Penalty) -> AttachedModel:
 class AttachedModel(Attached):
     """The handle of a penalty that is attached to a model; see `attach`."""
 
-    def __init__(self, model: BaseAlgorithm, penalty: Penalty, actor: Actor) -> None:
+    def __init__(self, model: BaseAlgorithm, penalty: Attachable, actor: Actor) -> None:
         super().__init__(actor, penalty)
         self.model = model
         self.actor = actor
@@ -94,12 +94,12 @@ class AttachedModel(Attached):
         self.actor.release()
 
     def _enter(self, first: nn.Module, args: tuple[Any, ...]) -> None:
-        if not self._measuring:
+        if not self._is_measuring():
             self.actor.enter(args[0])
 
     def _leave(self, last: nn.Module, args: tuple[Any, ...], output: Tensor) -> Any:
         """The last stage's output, carried."""
-        if self._measuring:
+        if self._is_measuring():
             return None
         call = self.actor.leave()
         if call is None:

@@ -8,7 +8,7 @@ import torch
 from sb3_contrib import TRPO as PlainTRPO  # noqa: N811
 from torch import Tensor, nn
 
-from condwrap.attach import Penalty
+from condwrap.attach import Attachable
 from condwrap.integrations.sb3 import AttachedModel
 from condwrap.integrations.sb3_actors import Actor
 
@@ -54,7 +54,7 @@ class AttachedTRPO(AttachedModel):
     so before each comparison the old one is set to surrogate_old - penalty_old + penalty_new.
     """
 
-    def __init__(self, model: Any, penalty: Penalty, actor: Actor) -> None:
+    def __init__(self, model: Any, penalty: Attachable, actor: Actor) -> None:
         if not isinstance(model, TRPO):
             raise TypeError(
                 f"the line search of {type(model).__module__}.{type(model).__name__} would not see "
@@ -94,7 +94,7 @@ class AttachedTRPO(AttachedModel):
         self._call = None
 
     def _leave(self, last: nn.Module, args: tuple[Any, ...], output: Tensor) -> Any:
-        if self._measuring:
+        if self._is_measuring():
             return
         call = self.actor.leave()
         if call is None or not last.training:

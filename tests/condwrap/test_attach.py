@@ -14,7 +14,7 @@ from torch import distributions as td
 from torch import nn
 from torch.utils.checkpoint import checkpoint
 
-from condwrap import ConditioningRegularizer, attach
+from condwrap import ConditioningRegularizer, attach, summary
 
 OBS = torch.randn(16, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 
@@ -314,6 +314,29 @@ def test_two_processes_average_loss_and_penalty(tmp_path):
     torch.multiprocessing.spawn(_train_a_rank, args=(str(tmp_path),), nprocs=2)
     for rank in range(2):
         assert_equal(torch.load(tmp_path / f"{rank}.pt"), expected)
+
+
+def test_two_penalties_on_one_module_add_up():
+    net = make_net()
+    other = ConditioningRegularizer(0.7, lambda_min=0.5, seed=2)
+    loss = square(net(OBS)) + make_penalty()(net, OBS).penalty + other(net, OBS).penalty
+    loss.backward()
+    expected = gradients(net)
+
+    handles = [attach(net, make_penalty())]
+    handles.append(attach(net, ConditioningRegularizer(0.7, lambda_min=0.5, seed=2)))
+    square(net(OBS)).backward()
+    assert_equal(gradients(net), expected)
+    assert [handle.metrics()["attach/backwards"] for handle in handles] == [1.0, 1.0]
+
+
+def test_measuring_a_module_in_training_mode_is_no_call_of_the_loop():
+    net = make_net()
+    expected = summary(net, OBS)
+    handle = attach(net, make_penalty())
+    assert summary(net, OBS) == expected
+    make_penalty()(net, OBS).penalty.backward()
+    assert handle.metrics()["attach/forwards"] == 0.0
 
 
 # --- what is as it was without it ----------------------------------------------------------------
