@@ -12,10 +12,13 @@ MODULES ?= $(wildcard condwrap/[a-z]*.py) condwrap/attacks condwrap/penalties \
 	harness/statistics harness/report/claims harness/evaluation
 SAMPLE ?= 60
 
-.PHONY: help run test tests slow check bench mutate lock clean
+# Each has tests/integrations/NAME.txt, test_NAME.py and condwrap/integrations/NAME*.py.
+FRAMEWORKS ?= $(basename $(notdir $(wildcard tests/integrations/*.txt)))
+
+.PHONY: help run test tests slow check bench integrations mutate lock clean
 
 help:  ## what each target does
-	@sed -n 's/^\([a-z]*\):.*##/\1\t/p' Makefile | expand -t 10
+	@sed -n 's/^\([a-z]*\):.*##/\1\t/p' Makefile | expand -t 14
 
 run: $(INSTALLED)  ## the main job: a first comparison, every agent at toy length, one page of both
 	$(BIN)/python -m harness run-all --suite first smoke
@@ -42,6 +45,22 @@ bench: $(INSTALLED)  ## benchmarks beside their peers, as one table; under half 
 	$(BIN)/python -m tests.benchmarks.table benchmarks.json
 	$(BIN)/python -m tests.benchmarks.figure benchmarks.json benchmarks.png
 
+integrations: $(FRAMEWORKS:%=integration-%)  ## tests with other frameworks, in environments of their own; FRAMEWORKS=sb3 chooses
+	@echo "passed: $(FRAMEWORKS)"
+
+integration-%: .venv-%/installed
+	.venv-$*/bin/python -m pytest tests/integrations/test_$*.py condwrap/integrations/$**.py \
+		--override-ini=addopts='--doctest-modules --strict-markers' --cov-config=/dev/null \
+		$(patsubst condwrap/integrations/%.py,--cov=condwrap.integrations.%,$(wildcard condwrap/integrations/$**.py)) \
+		--cov-report=term-missing:skip-covered --cov-fail-under=95
+
+.venv-%/installed: tests/integrations/%.txt pyproject.toml
+	$(PYTHON) -m venv .venv-$*
+	.venv-$*/bin/python -m pip install --quiet --requirement $<
+	.venv-$*/bin/python -m pip install --quiet --editable .
+	@touch $@
+.PRECIOUS: .venv-%/installed
+
 mutate: $(INSTALLED)  ## how many small changes the tests notice; MODULES=... chooses, SAMPLE=0 makes all
 	$(BIN)/python -m pip install --quiet --no-deps mutmut==3.8.1 libcst==1.9.0
 	$(BIN)/python tests/mutation --sample $(SAMPLE) $(MODULES)
@@ -63,5 +82,5 @@ lock:  ## write requirements.lock anew, from the newest versions that fit
 	rm -rf .venv-lock
 
 clean:  ## remove the environment and caches; results/ and runs/ stay
-	rm -rf .venv .venv-lock .coverage .hypothesis .*_cache dist
+	rm -rf .venv .venv-* .coverage .hypothesis .*_cache dist
 	find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +

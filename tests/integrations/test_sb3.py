@@ -480,7 +480,7 @@ def test_masked_logits_do_not_count(space, fraction):
         _, logprob, _ = policy.evaluate_actions(obs, actions, action_masks=allowed.float())
         found = gradients_of(model, 0.0 * logprob.mean())
     assert_close(found, expected)
-    assert torch.equal(seen.known[0] == 0, ~allowed)
+    assert (seen.known[0][~allowed] == 0).all()
 
 
 @pytest.mark.parametrize("algorithm", [sb3.PPO, sb3_contrib.MaskablePPO])
@@ -551,16 +551,16 @@ class Spy(TRPO):
 
     def train(self):
         self.kept = {}
-        order = np.random.get_state()
+        order = np.random.get_state()  # noqa: NPY002
         self.before = self.objectives(order)
         super().train()
         self.after = self.objectives(order)
 
     def objectives(self, order):
         """The surrogate and the penalty on the same noise, by SB3's own methods."""
-        np.random.set_state(order)  # the buffer's next permutation is that of the update
+        np.random.set_state(order)  # noqa: NPY002
         (batch,) = self.rollout_buffer.get(batch_size=None)
-        np.random.set_state(order)
+        np.random.set_state(order)  # noqa: NPY002
         distribution = self.policy.get_distribution(batch.observations)
         advantages = (batch.advantages - batch.advantages.mean()) / (batch.advantages.std() + 1e-8)
         ratio = (distribution.log_prob(batch.actions) - batch.old_log_prob).exp()
@@ -707,7 +707,6 @@ def test_a_penalty_that_needs_successors_is_refused():
 def test_the_examples_lower_psi(path, capsys):
     assert len(path.read_text().splitlines()) <= 40
     runpy.run_path(str(path), run_name="__main__")
-    numbers = [
-        float(line.split()[-1]) for line in capsys.readouterr().out.splitlines() if "psi" in line
-    ]
-    assert numbers[-1] < numbers[0]
+    lines = capsys.readouterr().out.splitlines()
+    numbers = [float(line.split()[-1]) for line in lines if line.startswith("psi")]
+    assert numbers[-1] < 0.5 * numbers[0]
