@@ -50,9 +50,9 @@ integrations: $(FRAMEWORKS:%=integration-%)  ## tests with other frameworks, in 
 
 integration-%: .venv-%/installed
 	.venv-$*/bin/python -m pytest tests/integrations/test_$*.py condwrap/integrations/$**.py \
-		--override-ini=addopts='--doctest-modules --strict-markers' --cov-config=/dev/null \
-		$(patsubst condwrap/integrations/%.py,--cov=condwrap.integrations.%,$(wildcard condwrap/integrations/$**.py)) \
-		--cov-report=term-missing:skip-covered --cov-fail-under=95
+		--override-ini=addopts='--doctest-modules --strict-markers' \
+		--cov --cov-config=tests/integrations/coverage.ini \
+		--cov-report=term-missing --cov-fail-under=95
 
 .venv-%/installed: tests/integrations/%.txt pyproject.toml
 	$(PYTHON) -m venv .venv-$*
