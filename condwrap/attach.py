@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from condwrap.carry import Call, Carry, find_observation, replace_tensors, tensors_in
 from condwrap.penalties.protocol import Result
-from condwrap.policy import Policy, is_measuring
+from condwrap.policy import Policy, is_measuring, measuring
 
 Scale = float | Callable[[], float]
 
@@ -99,7 +99,6 @@ class Attached:
         self.penalty = penalty
         self.obs = obs
         self.scale = 1.0
-        self._measuring = False
         self._forwards = 0
         self._sums: dict[str, float] = {}
         self._backwards = 0
@@ -143,7 +142,7 @@ class Attached:
     @torch.compiler.disable  # type: ignore[untyped-decorator]
     def _carry(self, args: tuple[Any, ...], kwargs: dict[str, Any], output: Any) -> Any:
         """The output, through a node whose backward adds the penalty's gradient."""
-        if self._is_measuring() or not (self.module.training and torch.is_grad_enabled()):
+        if is_measuring() or not (self.module.training and torch.is_grad_enabled()):
             return None  # which leaves the output as it is
         carried = [x for x in tensors_in(output) if x.requires_grad]
         if not carried:
@@ -165,17 +164,10 @@ class Attached:
         passed = Carry.apply(call, *carried, *call.inputs, *call.parameters)  # type: ignore[no-untyped-call]
         return replace_tensors(output, carried, passed)
 
-    def _is_measuring(self) -> bool:
-        """Whether a penalty or a diagnostic evaluates the module, which is no call of the loop."""
-        return self._measuring or is_measuring()
-
     def _measure(self, policy: Policy, obs: Any, output: Any) -> Tensor:
         """The scaled penalty; its metrics are kept."""
-        self._measuring = True
-        try:
+        with measuring():
             result = self.penalty(policy, obs, output=output)
-        finally:
-            self._measuring = False
 
         self._record(result.metrics())
         scale = self.scale() if callable(self.scale) else self.scale

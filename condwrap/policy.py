@@ -168,7 +168,7 @@ def untouched(policy: Policy, device: torch.device) -> Iterator[None]:
             yield
         else:
             devices = [device] if device.type == "cuda" else []
-            with _copied_buffers(found), torch.random.fork_rng(devices), _marked():
+            with _copied_buffers(found), torch.random.fork_rng(devices), measuring():
                 yield
     finally:
         for norm in norms:
@@ -176,12 +176,13 @@ def untouched(policy: Policy, device: torch.device) -> Iterator[None]:
 
 
 def is_measuring() -> bool:
-    """Whether this is an evaluation inside `untouched`, which an attached penalty leaves alone."""
+    """Whether a penalty or a diagnostic evaluates a policy: that is no call of a training loop."""
     return _measuring.get()
 
 
 @contextlib.contextmanager
-def _marked() -> Iterator[None]:
+def measuring() -> Iterator[None]:
+    """Mark evaluations, so that attached penalties leave them alone; `untouched` does it too."""
     token = _measuring.set(True)
     try:
         yield

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from condwrap.attach import Attachable, Attached, Hook
 from condwrap.integrations.sb3_actors import Actor, find_actor, names_of
+from condwrap.policy import is_measuring
 
 
 def attach(model: BaseAlgorithm, penalty: Attachable) -> AttachedModel:
@@ -94,12 +95,12 @@ class AttachedModel(Attached):
         self.actor.release()
 
     def _enter(self, first: nn.Module, args: tuple[Any, ...]) -> None:
-        if not self._is_measuring():
+        if not is_measuring():
             self.actor.enter(args[0])
 
     def _leave(self, last: nn.Module, args: tuple[Any, ...], output: Tensor) -> Any:
         """The last stage's output, carried."""
-        if self._is_measuring():
+        if is_measuring():
             return None
         call = self.actor.leave()
         if call is None:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from condwrap.attach import Attachable
 from condwrap.integrations.sb3 import AttachedModel
 from condwrap.integrations.sb3_actors import Actor
+from condwrap.policy import is_measuring
 
 
 class TRPO(PlainTRPO):  # type: ignore[misc]
@@ -24,7 +25,7 @@ class TRPO(PlainTRPO):  # type: ignore[misc]
     Example:
         >>> from condwrap import ConditioningRegularizer
         >>> from condwrap.integrations.sb3 import attach
-        >>> model = TRPO("MlpPolicy", "Pendulum-v1", n_steps=64)
+        >>> model = TRPO("MlpPolicy", "Pendulum-v1", n_steps=64, batch_size=64)
         >>> handle = attach(model, ConditioningRegularizer(coefficient=0.1))
         >>> _ = model.learn(64)
         >>> handle.metrics()["attach/backwards"]
@@ -94,7 +95,7 @@ class AttachedTRPO(AttachedModel):
         self._call = None
 
     def _leave(self, last: nn.Module, args: tuple[Any, ...], output: Tensor) -> Any:
-        if self._is_measuring():
+        if is_measuring():
             return
         call = self.actor.leave()
         if call is None or not last.training:
