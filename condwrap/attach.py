@@ -159,9 +159,10 @@ class Attached:
             output=output,
             carried=carried,
             inputs=[x for x in tensors_in((args, kwargs)) if x.requires_grad],
-            parameters=[x for x in self.module.parameters() if x.requires_grad],
+            parameters=dict(self.module.named_parameters()),
+            buffers=dict(self.module.named_buffers()),
         )
-        passed = Carry.apply(call, *carried, *call.inputs, *call.parameters)  # type: ignore[no-untyped-call]
+        passed = Carry.apply(call, *carried, *call.inputs, *call.learnt)  # type: ignore[no-untyped-call]
         return replace_tensors(output, carried, passed)
 
     def _measure(self, policy: Policy, obs: Any, output: Any) -> Tensor:

@@ -30,10 +30,18 @@ class Call:
     """tensors of the output, those with a gradient"""
     inputs: list[Tensor]
     """tensors among the arguments, those that require a gradient"""
-    parameters: list[Tensor]
+    parameters: dict[str, Tensor]
+    """what the module had for its parameters during the call"""
+    buffers: dict[str, Tensor]
+    """the same for its buffers"""
+
+    @property
+    def learnt(self) -> list[Tensor]:
+        """The parameters that require a gradient."""
+        return [x for x in self.parameters.values() if x.requires_grad]
 
     def gradients(self) -> Sequence[Tensor | None]:
-        """Of the scaled penalty: for carried, inputs and parameters."""
+        """Of the scaled penalty: for carried, inputs and learnt parameters."""
         carried = [x.detach().requires_grad_() for x in self.carried]
         inputs = [x.detach().requires_grad_() for x in self.inputs]
         args, kwargs = replace_tensors((self.args, self.kwargs), self.inputs, inputs)
@@ -42,12 +50,21 @@ class Call:
         if _is_reusable(self.module, carried):  # then pi(S) needs no second evaluation
             output = replace_tensors(self.output, self.carried, carried)
 
+        own = dict(self.module.named_parameters())
+        lent = any(own.get(name) is not x for name, x in self.parameters.items())
+        module = self.module  # which the penalty finds among what the function below holds
+
         def policy(obs: Any) -> Any:
-            return _call(self.module, args, kwargs, self.which, obs)
+            given, named = _with_obs(args, kwargs, self.which, obs)
+            if not lent:
+                return module(*given, **named)
+            # functional_call lends parameters for one call: a call in backward has to lend them
+            buffers = {name: x.clone() for name, x in self.buffers.items()}
+            return torch.func.functional_call(module, self.parameters | buffers, given, named)
 
         with torch.enable_grad():
             penalty = self.measure(policy, obs, output)
-            leaves = [*carried, *inputs, *self.parameters]
+            leaves = [*carried, *inputs, *self.learnt]
             if not penalty.requires_grad:  # a coefficient of 0
                 return [None] * len(leaves)
             return torch.autograd.grad(penalty, leaves, allow_unused=True)
@@ -101,13 +118,13 @@ def find_observation(args: tuple[Any, ...], kwargs: dict[str, Any], which: int |
         ) from None
 
 
-def _call(
-    module: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any], which: int | str, obs: Any
-) -> Any:
-    """The module on another observation."""
+def _with_obs(
+    args: tuple[Any, ...], kwargs: dict[str, Any], which: int | str, obs: Any
+) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """The arguments with another observation."""
     if isinstance(which, str):
-        return module(*args, **{**kwargs, which: obs})
-    return module(*args[:which], obs, *args[which + 1 :], **kwargs)
+        return args, {**kwargs, which: obs}
+    return (*args[:which], obs, *args[which + 1 :]), kwargs
 
 
 # --- tensors in a structure ----------------------------------------------------------------------

@@ -193,6 +193,42 @@ def test_a_shared_trunk_gets_the_gradient_through_its_features():
     assert_equal(gradients(both), expected)
 
 
+def test_parameters_that_are_lent_for_the_call_get_the_gradient():
+    """As torch.func.functional_call and TorchRL's loss modules lend them."""
+    net = make_net()
+    expected = explicit(net)
+    empty = copy.deepcopy(net).to("meta")
+    handle = attach(empty, make_penalty())
+    lent = dict(net.named_parameters())
+    torch.func.functional_call(empty, lent, (OBS,)).square().mean().backward()
+    assert_equal(gradients(net), expected)
+    assert handle.metrics()["attach/backwards"] == 1.0
+    assert all(x.is_meta for x in empty.parameters())
+
+
+class Counting(nn.Module):
+    """A network that keeps a running mean of its inputs, as normalizers do."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = make_net()
+        self.register_buffer("mean", torch.zeros(4, dtype=torch.float64))
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        self.mean.add_(obs.detach().mean(0))
+        return self.net(obs - self.mean)
+
+
+def test_buffers_that_are_lent_for_the_call_are_as_after_it():
+    net = Counting()
+    mean = torch.ones(4, dtype=torch.float64)
+    attach(net, make_penalty())
+    lent = {name: x.detach().clone().requires_grad_() for name, x in net.named_parameters()}
+    torch.func.functional_call(net, {**lent, "mean": mean}, (OBS,)).sum().backward()
+    torch.testing.assert_close(mean, 1 + OBS.mean(0))
+    assert torch.equal(net.mean, torch.zeros_like(mean))
+
+
 def test_the_observation_is_found_by_its_name():
     net = Recurrent()
     start = torch.zeros(16, 5, dtype=torch.float64)
