@@ -45,7 +45,9 @@ class Nothing:
 
 
 def weights(module: torch.nn.Module) -> dict[str, torch.Tensor]:
-    return {name: x.detach().clone() for name, x in module.state_dict().items()}
+    """Copies of the module's tensors; some frameworks keep the optimizers' states beside them."""
+    state = module.state_dict().items()
+    return {name: x.detach().clone() for name, x in state if isinstance(x, torch.Tensor)}
 
 
 def assert_same_bits(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> None:
