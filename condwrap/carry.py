@@ -52,15 +52,15 @@ class Call:
 
         own = dict(self.module.named_parameters())
         lent = any(own.get(name) is not x for name, x in self.parameters.items())
-        module = self.module  # which the penalty finds among what the function below holds
 
         def policy(obs: Any) -> Any:
             given, named = _with_obs(args, kwargs, self.which, obs)
             if not lent:
-                return module(*given, **named)
+                return self.module(*given, **named)
             # functional_call lends parameters for one call: a call in backward has to lend them
             buffers = {name: x.clone() for name, x in self.buffers.items()}
-            return torch.func.functional_call(module, self.parameters | buffers, given, named)
+            state = self.parameters | buffers
+            return torch.func.functional_call(self.module, state, given, named)
 
         with torch.enable_grad():
             penalty = self.measure(policy, obs, output)

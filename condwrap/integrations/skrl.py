@@ -11,11 +11,11 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from condwrap.attach import Attached, Penalty
+from condwrap.attach import Attachable, Attached
 from condwrap.attach import attach as attach_to_module
 
 
-def attach(agent: Any, penalty: Penalty) -> Attached:
+def attach(agent: Any, penalty: Attachable) -> Attached:
     """Add a penalty's gradient to the loss of a skrl agent's policy.
 
     Observations are perturbed after the agent's preprocessor. With mixed precision the gradient

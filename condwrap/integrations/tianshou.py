@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import nn
 
-from condwrap.attach import Attached, Penalty
+from condwrap.attach import Attachable, Attached
 from condwrap.attach import attach as attach_to_module
 
 
-def attach(actor: nn.Module, penalty: Penalty) -> Attached:
+def attach(actor: nn.Module, penalty: Attachable) -> Attached:
     """Add a penalty's gradient to the loss of Tianshou's policy.
 
     Args:
