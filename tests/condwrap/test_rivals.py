@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from types import SimpleNamespace
 
 import pytest
@@ -120,3 +121,13 @@ def test_bad_settings_are_refused(changed, message):
     with pytest.raises(ValueError, match=message):
         RivalArgs(**changed).check_conditioning()
     RivalArgs(printed_sign=True).check_conditioning()
+
+
+def test_a_rival_is_not_compiled():
+    @dataclasses.dataclass(frozen=True)
+    class Args(RivalArgs):
+        compile: bool = True
+
+    Args().check_conditioning()
+    with pytest.raises(ValueError, match="compile must be False with the penalty sa"):
+        Args(penalty="sa").check_conditioning()

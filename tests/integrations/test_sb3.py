@@ -24,9 +24,12 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from torch import nn
 
 from condwrap import ConditioningRegularizer
+from condwrap.__main__ import main
+from condwrap.disk import DiskError, read_policy
 from condwrap.integrations.sb3 import attach
 from condwrap.integrations.sb3_actors import log_probabilities
 from condwrap.integrations.sb3_trpo import TRPO
+from condwrap.policy import flat_output
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 LARGE = 10.0
@@ -710,3 +713,43 @@ def test_the_examples_lower_psi(path, capsys):
     lines = capsys.readouterr().out.splitlines()
     numbers = [float(line.split()[-1]) for line in lines if line.startswith("psi")]
     assert numbers[-1] < 0.5 * numbers[0]
+
+
+# --- models on disk ------------------------------------------------------------------------------
+
+READ = [case for case in CASES if case.algorithm not in (sb3_contrib.MaskablePPO, TRPO)]
+READ = [case for case in READ if case.algorithm is not sb3_contrib.RecurrentPPO]
+
+
+def numbers_of(output):
+    return flat_output(output, "default", torch.Size([8]))
+
+
+@pytest.mark.parametrize("case", READ, ids=lambda case: case.algorithm.__name__)
+def test_a_saved_models_policy_is_what_counts(case, tmp_path):
+    model = case.make()
+    model.save(tmp_path / "model.zip")
+    with pytest.raises(DiskError, match="--trust"):
+        read_policy(str(tmp_path / "model.zip"))
+    found = read_policy(str(tmp_path / "model.zip"), trust=True)
+
+    raw = np.stack([model.observation_space.sample() for _ in range(8)])
+    model.policy.set_training_mode(False)
+    expected = output_of(model, model.policy.obs_to_tensor(raw)[0])
+    output = found.policy(found.normalize(torch.as_tensor(raw)))
+    torch.testing.assert_close(numbers_of(output), numbers_of(expected))
+
+
+@pytest.mark.parametrize("algorithm", [sb3_contrib.MaskablePPO, sb3_contrib.RecurrentPPO])
+def test_a_saved_policy_with_a_context_is_refused(algorithm, tmp_path):
+    case_of(algorithm).make().save(tmp_path / "model.zip")
+    with pytest.raises(DiskError, match="recurrent or masked: load it yourself"):
+        read_policy(str(tmp_path / "model.zip"), trust=True)
+
+
+def test_the_command_measures_a_saved_model(tmp_path, capsys):
+    case_of(sb3.PPO).make().save(tmp_path / "model.zip")
+    main(["summary", str(tmp_path / "model.zip"), "--trust", "--env-id", "Pendulum-v1"])
+    out = capsys.readouterr().out
+    assert "a model of PPO, 0 steps; observations of 1024 steps of Pendulum-v1 with its own" in out
+    assert "3 observed values, 1 outputs" in out
