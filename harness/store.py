@@ -86,10 +86,14 @@ class Store:
 
         One that has been extended since keeps the evaluation that it has: its agent is gone.
         """
-        if self.path(spec, _shorter("done.json", spec.args["total_timesteps"])).exists():
+        if self._went_on(spec):
             return True
         saved = self.saved(spec) or {}
         return answers(saved.get("evaluation", {}), spec.evaluation)
+
+    def _went_on(self, spec: RunSpec) -> bool:
+        """Whether the run of this length has been extended since it was finished."""
+        return self.path(spec, _shorter("done.json", spec.args["total_timesteps"])).exists()
 
     def _done(self, spec: RunSpec) -> dict[str, Any]:
         """The content of done.json; empty where there is none."""
@@ -288,10 +292,10 @@ class Store:
 
         Of a run that has been extended since, only the evaluation is still a file of its own.
         """
-        was_extended = spec.args["total_timesteps"] in self.shorter_lengths(spec)
+        went_on = self._went_on(spec)
         expected = self._done(spec).get("sha256", {})
         for name in expected.keys() & names:
-            if was_extended and name != "evaluation.csv":
+            if went_on and name != "evaluation.csv":
                 continue
             path = self.kept(spec, name)
             if not path.exists() or checksum(path) != expected[name]:

@@ -26,10 +26,10 @@ from condwrap import attacks
 from condwrap.attacks.ball import Norm
 from harness.evaluation.checkpoint import Checkpoint, read_checkpoint
 from harness.evaluation.control import Episode, episode_seeds, load_learner, make_env
-from harness.evaluation.runs import Show, ask
+from harness.evaluation.runs import Show, ask, keep
 from harness.evaluation.sarsa import learn_action_value
 from harness.evaluation.settings import CONTROL, EvaluationError, Settings
-from harness.files import read_json, write_json
+from harness.files import read_json
 
 ATTACKS = ("random", "mad", "critic", "sarsa")
 RADII = (0.0, 0.05, 0.1)
@@ -121,16 +121,8 @@ def evaluate_robustness(
     total = played * len(_groups(settings.episodes))
     found = pd.concat(show(parts, total), ignore_index=True)
     found = found.sort_values(["attack", "radius", "episode"], key=_in_order(threat))
-    keep(path, found, about)
+    keep(path, "robustness", found, about)
     return found.reset_index(drop=True)
-
-
-def keep(path: Path, episodes: pd.DataFrame, about: dict[str, Any]) -> None:
-    """Write both files so that robustness.json never tells of another robustness.csv."""
-    (path / "robustness.json").unlink(missing_ok=True)
-    episodes.to_csv(path / "robustness.csv.tmp", index=False)
-    (path / "robustness.csv.tmp").replace(path / "robustness.csv")
-    write_json(path / "robustness.json", about)
 
 
 def evaluate(checkpoint: Checkpoint, threat: Threat, episodes: int) -> Iterator[pd.DataFrame]:

@@ -48,7 +48,7 @@ def evaluate_run(
     else:
         parts = control.evaluate(checkpoint, settings.episodes)
         episodes = pd.concat(show(parts, 2 * settings.episodes), ignore_index=True)
-    keep(path, episodes, about)
+    keep(path, "evaluation", episodes, about)
     return episodes
 
 
@@ -66,9 +66,9 @@ def ask(checkpoint: Checkpoint, settings: Settings, names: tuple[str, ...]) -> d
     return {name: getattr(settings, name) for name in names}
 
 
-def keep(path: Path, episodes: pd.DataFrame, about: dict[str, Any]) -> None:
-    """Write both files so that evaluation.json never tells of another evaluation.csv."""
-    (path / "evaluation.json").unlink(missing_ok=True)
-    episodes.to_csv(path / "evaluation.csv.tmp", index=False)
-    (path / "evaluation.csv.tmp").replace(path / "evaluation.csv")
-    write_json(path / "evaluation.json", about)
+def keep(path: Path, name: str, episodes: pd.DataFrame, about: dict[str, Any]) -> None:
+    """Write name.csv and name.json so that the second never tells of another first."""
+    (path / f"{name}.json").unlink(missing_ok=True)
+    episodes.to_csv(path / f"{name}.csv.tmp", index=False)
+    (path / f"{name}.csv.tmp").replace(path / f"{name}.csv")
+    write_json(path / f"{name}.json", about)
